@@ -51,12 +51,12 @@ def release_again(
     longest_s = min(2 * dials.exposure_s() + SECOND_TRY_S, timeout_s)
     if (files := _first_files(link, longest_s)) or longest_s >= timeout_s:
         return (trigger_s, *files)
-    _LOG.warning("no photograph came; some bodies take none for 3 s after they were opened: releasing once more")
     again_s = time.monotonic()
     try:
         link.call("Releasing the shutter", lambda camera: camera.trigger_capture())
     except DeviceBusyError:
         return (trigger_s,)
+    _LOG.warning("no photograph came, so it was released once more; some bodies take none for 3 s after opening")
     return (again_s,)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from functools import cache
+from importlib import resources
 from pathlib import Path
 
 from simulators.faults import FaultPlan
@@ -19,7 +20,7 @@ STORAGE, FOLDER_DCIM, FOLDER_PICTURES = 0x00010001, 0x30000000, 0x30100000
 FOLDERS = {FOLDER_DCIM: ("DCIM", 0), FOLDER_PICTURES: ("100NZ___", FOLDER_DCIM)}
 COMPRESSION, F_NUMBER, ISO, EXPOSURE_TIME = 0x5004, 0x5007, 0x500F, 0xD100
 _RAW, _BOTH = (4,), (5, 6, 7)  # compressions
-_FOLDER = Path(__file__).with_name("recordings")
+_FOLDER = Path(str(resources.files("simulators.nikon_camera"))) / "recordings"
 _UNSTATED = {COMPRESSION: 2, F_NUMBER: 800, ISO: 100, EXPOSURE_TIME: 1 << 16 | 60}
 
 

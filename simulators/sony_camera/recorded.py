@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from importlib import resources
 from pathlib import Path
 
 from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import CONTROLS, TEXT, U16, BodyTable, CameraProperty, Code, Enabled
 
-_FOLDER = Path(__file__).with_name("recordings")
+_FOLDER = Path(str(resources.files("simulators.sony_camera"))) / "recordings"
 _TYPES = {"i8": 1, "u8": 2, "i16": 3, "u16": 4, "i32": 5, "u32": 6, "i64": 7, "u64": 8, "str": TEXT}
 # As libgphoto2 concluded; or the two bytes of the entry, GetSet and IsEnabled, where they are known.
 _ACCESS = {"rw": (True, Enabled.ON), "ro": (False, Enabled.DISPLAY_ONLY), "0/1": (False, Enabled.ON)}

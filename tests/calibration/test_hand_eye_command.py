@@ -65,6 +65,7 @@ def test_poses_that_are_read_wrongly_are_refused_and_the_mistake_is_named(
         assert not out.exists()
 
 
+@pytest.mark.slow
 def test_squares_that_are_not_as_stated_are_refused_with_their_true_side(
     photographs: BoardFolder, tmp_path: Path
 ) -> None:

@@ -272,6 +272,7 @@ def world_socket(answer: dict[str, Any]) -> Generator[str]:
             thread.join()
 
 
+@pytest.mark.slow
 def test_pictures_of_the_world_and_their_true_pose(tmp_path: Path) -> None:
     log = tmp_path / "truth.jsonl"
     pose = look_at(np.array([0.0, -0.3, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))

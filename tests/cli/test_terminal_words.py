@@ -142,7 +142,10 @@ def test_simulators_explain_themselves_as_every_command_does(monkeypatch: pytest
         (["rig", "--scene", "7", "--dir", "d", "--arms", "3"], "'3' is not one of '1', '2'"),
         (["camera", "--image", "a.jpg", "b.jpg", "--bogus"], "No such option: --bogus"),
         (["lightbocks"], "No such simulator 'lightbocks'. Did you mean 'lightbox'?"),
-        (["--bogus"], "Which one? There are ur, kuka, camera, canon, gige, video, scanner, ct, lightbox, rig, grbl"),
+        (
+            ["--bogus"],
+            "Which one? There are ur, kuka, camera, canon, nikon, gige, video, scanner, ct, lightbox, rig, grbl",
+        ),
     ],
 )
 def test_a_simulator_refuses_wrong_usage_as_every_command_does(

@@ -71,6 +71,7 @@ def test_a_plane_shifted_along_its_normal_is_off_by_the_shift(offset: float, see
     assert score.f_scores == (0.0, 0.0)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 100), scale=st.floats(0.8, 1.3))
 @settings(max_examples=4, deadline=None)
 def test_exchanging_the_surfaces_exchanges_the_directions(seed: int, scale: float) -> None:
@@ -82,6 +83,7 @@ def test_exchanging_the_surfaces_exchanges_the_directions(seed: int, scale: floa
     assert forth.f_scores == pytest.approx(back.f_scores, abs=0.02)
 
 
+@pytest.mark.slow
 @given(vector=st.tuples(*[st.floats(-3, 3)] * 3), shift=st.tuples(*[st.floats(-1, 1)] * 3))
 @settings(max_examples=4, deadline=None)
 def test_a_rigid_motion_of_both_changes_nothing(

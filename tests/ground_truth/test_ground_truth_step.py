@@ -200,6 +200,7 @@ def unpacked(packed: dict[str, str]) -> np.ndarray[Any, Any]:
     return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
 
 
+@pytest.mark.slow
 def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None:
     corners = ((-0.022, 0.012, 0.03), (-0.016, 0.012, 0.03), (-0.016, 0.018, 0.03), (-0.022, 0.018, 0.03))
     drawn = RegionDrawn(step="ground_truth", source="ct", corners_m=corners, seen_along=(0.0, 0.0, 1.0))
@@ -217,6 +218,7 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     assert np.all(columns["source"][within] == 0)
 
 
+@pytest.mark.slow
 def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(bench: Bench) -> None:
     state, _, points = fused(bench)
     (number,) = state.steps["ground_truth"].result["details"]["taken_away"]

@@ -90,6 +90,7 @@ def measured(bench: Bench) -> StepMeasured:
     return next(p for p in bench.payloads(StepMeasured) if p.step == "capture")
 
 
+@pytest.mark.slow
 def test_photographs_of_a_card_become_views_as_those_of_a_cable_do(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -108,6 +109,7 @@ def test_photographs_of_a_card_become_views_as_those_of_a_cable_do(
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_a_host_clock_that_was_set_back_lets_no_older_photograph_in(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -125,6 +127,7 @@ def test_a_host_clock_that_was_set_back_lets_no_older_photograph_in(
     assert "taken before this step began" in left_out.message
 
 
+@pytest.mark.slow
 def test_after_a_restart_nothing_is_taken_twice_and_nothing_is_lost(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -134,6 +134,7 @@ def test_what_is_no_data_set_is_refused(tmp_path: Path) -> None:
     assert "export RUN --format matching" in printed.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_an_unknown_method_and_a_learned_one_without_its_packages_are_refused(folder: Path, tmp_path: Path) -> None:
     status, printed = run(folder, tmp_path / "out", method="magic")
     assert status == 1

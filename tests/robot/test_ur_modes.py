@@ -123,5 +123,6 @@ def test_the_driver_says_which_mode_and_stop_hold_the_arm() -> None:
         let_move(arm)
         travel(arm, turned(arm, 0.1))
         dashboard(host, "power off", "power on")
+        wait_for(lambda: arm.state().robot_mode in ("POWER_ON", "IDLE"))
         with pytest.raises(DeviceRefusedError, match=r"mode (POWER_ON|IDLE)"):
             move(arm, turned(arm, 0.1))

@@ -206,6 +206,17 @@ def computed(folder: Path, voxel_mm: float) -> Ct:
 
 
 @pytest.mark.slow
+def test_the_products_of_one_acquisition_are_delivered_together(tmp_path: Path) -> None:
+    words = ("ct", "--scene", str(SEED), "--folder", str(tmp_path), "--once", "--products", "--voxel-mm", "2.5")
+    with simulator(*words) as running:
+        assert running.process.wait(COMPUTED_S) == 0
+    found = DicomFolder(DicomFolderConfig(folder=tmp_path, stable_s=0.0)).series()
+    assert len(found) == 3
+    assert not any(series.problems for series in found)
+    assert len({series.frame_of_reference for series in found}) == 1
+
+
+@pytest.mark.slow
 def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -425)
     world = apply(ct.T_world_ct, vertices)

@@ -293,6 +293,9 @@ RUN_ELSEWHERE = {
     'orthocapture simulate rig --scene 7 --dir rig --camera "Canon EOS R5"': (
         "tests/further/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
     ),
+    "orthocapture simulate ct --scene 7 --folder ct --once --products": (
+        "tests/scanner/test_scan_ct_simulators.py::test_the_products_of_one_acquisition_are_delivered_together"
+    ),
     "orthocapture simulate canon": "tests/canon/test_canon_driver.py::test_identity_and_report",
     "orthocapture simulate camera --recorded ilce-7rm5-2.02": (
         "tests/camera/test_recorded_bodies.py::test_a_recorded_body_is_driven_or_refused_in_words_that_help"

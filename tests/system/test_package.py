@@ -25,6 +25,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Package:
     return installed_package(tmp_path_factory)
 
 
+@pytest.mark.slow
 def test_wheel_and_sdist_hold_every_file_of_the_packages(package: Package) -> None:
     files = {path.relative_to(REPOSITORY).as_posix() for name in PACKAGES for path in (REPOSITORY / name).rglob("*")
              if path.is_file() and path.suffix != ".pyc"}  # fmt: skip
@@ -42,6 +43,7 @@ def test_nothing_is_looked_for_beside_a_source_file() -> None:
             assert "Path(__file__)" not in path.read_text(encoding="utf-8"), path
 
 
+@pytest.mark.slow
 def test_the_code_of_the_wheel_is_what_runs(package: Package, tmp_path: Path) -> None:
     told = subprocess.run(
         [package.bin / "python", "-c", "import service, protocols; print(service.__file__, protocols.__file__)"],
@@ -51,6 +53,7 @@ def test_the_code_of_the_wheel_is_what_runs(package: Package, tmp_path: Path) ->
     assert package.run("--version", cwd=tmp_path).stdout == "orthocapture 0.1.0\n"
 
 
+@pytest.mark.slow
 def test_the_shell_completes_commands_and_options(package: Package, tmp_path: Path) -> None:
     for typed, offered in (("orthocapture dem", ["demo"]), ("orthocapture store gc --rem", ["--remove"])):
         answer = package.run(
