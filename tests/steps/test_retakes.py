@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,9 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.core.records.events import StepNote
+from service.steps.capture.plan import planning
+from service.steps.capture.plan.viewpoints import Viewpoint
+from service.steps.kinds.captures import viewpoint_capture
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 
@@ -21,10 +24,17 @@ def begin(tmp_path: Path) -> Generator[Callable[[str], Bench]]:
 
 
 def test_images_with_other_settings_are_offered_to_be_taken_again_and_only_those(
-    begin: Callable[[str], Bench],
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = begin(PROTOCOL)
     turned = {2}
+    planned: list[list[str]] = []
+
+    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> planning.StepPlan:
+        planned.append([viewpoint.name for viewpoint in viewpoints])
+        return planning.plan_step(context, viewpoints, *more, **named)
+
+    monkeypatch.setattr(viewpoint_capture, "plan_step", plan_step)
 
     def exif(applied: CameraSettings) -> CameraSettings:
         return other_settings(applied) if bench.rig.shutter.exposures in turned else applied
@@ -44,4 +54,7 @@ def test_images_with_other_settings_are_offered_to_be_taken_again_and_only_those
     assert "Confirm to take 1 image again; all others are kept" in asked[0]
     assert [note.note for note in bench.payloads(StepNote) if note.note == "retakes"] == ["retakes"]
     assert bench.captured() == ["v001", "v002", "v003", "v004", "v002"]
+    assert planned == [["v001", "v002", "v003", "v004"], ["v002"]], (
+        "no motion without a plan from where the arm stands"
+    )
     bench.must_verify()

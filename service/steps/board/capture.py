@@ -29,7 +29,7 @@ from service.steps.board.plan import (
 from service.steps.board.poses import BoardPoses
 from service.steps.capture.plan.planning import arm_at_station, plan_step, usual_posture
 from service.steps.capture.plan.viewpoints import Viewpoint
-from service.steps.capture.retakes import to_take_again
+from service.steps.capture.retakes import taken_for_good, to_take_again
 from service.steps.capture.views import CaptureTask, capture_viewpoints
 from service.steps.context import StepContext
 from service.steps.notes import BOARD_POSES, BoardPlan, BoardPose, board_plans
@@ -277,8 +277,9 @@ class BoardCapture:
     # --- capture and looks ---
 
     def _capture(self, poses: Sequence[Viewpoint]) -> None:
-        there = {capture.viewpoint for capture in self.context.evidence.captures(self.context.step.id)}
-        todo = [v for v in poses if v.name not in there]
+        again = to_take_again(self.context)
+        done = taken_for_good(self.context, again)
+        todo = [v for v in poses if v.name not in done]
         refused: Mapping[str, str] = {}
         stands_rad: dict[str, Array] = {}
         if todo and not self.given:
@@ -288,13 +289,13 @@ class BoardCapture:
             )
             todo, refused, stands_rad = list(planned.viewpoints), planned.refused, dict(planned.starts_rad)
         task = CaptureTask(
-            [*todo, *(v for v in poses if v.name in there)],
+            [*todo, *(v for v in poses if v.name in done)],
             self._mount,
             image_kind="board_image",
             refused=refused,
             on_captured=self._looks.begin,
             stop=lambda: bool(self._looks.spoilt_in_a_row()),
-            again=to_take_again(self.context),
+            again=again,
             stands_rad=stands_rad,
         )
         capture_viewpoints(self.context, task)

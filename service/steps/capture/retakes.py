@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from service.core.gates.verdict import describe, evaluate_gates
 from service.steps.capture.spoilt import CLEAN, spoilt_before
@@ -30,6 +30,19 @@ def to_take_again(context: StepContext) -> set[str]:
     attempt, departed = attempts[-1]
     departing = {c.artefacts[0].sha256 for c in captures if c.viewpoint in departed and c.attempt <= attempt}
     return departing | spoilt_before(context)
+
+
+def taken_for_good(context: StepContext, again: Collection[str]) -> set[str]:
+    """The viewpoints that need no image any more: theirs is as required, and is not one of `again` (SHA-256).
+
+    All others are reached by a motion, so they belong to the plan.
+    """
+    newest = {capture.viewpoint: capture for capture in context.evidence.captures(context.step.id)}
+    return {
+        name
+        for name, capture in newest.items()
+        if all(capture.verdicts.values()) and capture.artefacts[0].sha256 not in again
+    }
 
 
 def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> str:

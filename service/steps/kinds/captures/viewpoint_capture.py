@@ -13,7 +13,7 @@ from service.steps.capture.live_numbers import LiveAnalysis, LiveParams
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.plan.planning import feasible_extra, plan_step
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
-from service.steps.capture.retakes import advise_retakes, to_take_again
+from service.steps.capture.retakes import advise_retakes, taken_for_good, to_take_again
 from service.steps.capture.views import CaptureTask, CaptureTotals, capture_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import CaptureMeasures, Count, ErrorMm, PredictedMeasures
@@ -65,8 +65,9 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Capture every viewpoint set of this step, and the viewpoints that an earlier attempt asked for."""
-    capture = _Capture(context, params)
-    totals = capture.take(capture.viewpoints, to_take_again(context))
+    again = to_take_again(context)
+    capture = _Capture(context, params, again)
+    totals = capture.take(capture.viewpoints, again)
     measures: dict[str, float] = {}
     spoilt: Mapping[str, str] = {}
     if capture.live is not None:
@@ -92,8 +93,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 class _Capture:
     """The viewpoints of one execution of the step, and what is computed while they are captured."""
 
-    def __init__(self, context: StepContext, params: Params) -> None:
-        self._context, self._purpose = context, params.purpose
+    def __init__(self, context: StepContext, params: Params, again: Collection[str]) -> None:
+        self._context, self._purpose, self._order = context, params.purpose, params.order
         plan = [
             viewpoint
             for viewpoint_set in params.viewpoints
@@ -107,11 +108,18 @@ class _Capture:
             plan += [viewpoint for viewpoint in self._extra if viewpoint.name in wanted]
         context.devices.camera()  # before planning: without a camera no plan is needed
         self._nominal = context.devices.nominal_T_flange_camera()
-        there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
-        planned = plan_step(context, [v for v in plan if v.name not in there], self._nominal, params.order)
-        self._refused, self._stands_rad = planned.refused, dict(planned.starts_rad)
+        done = taken_for_good(context, again)
         self._features = EarlyFeatures.begin(context, plan)
-        self.viewpoints = [*planned.viewpoints, *(v for v in plan if v.name in there)]
+        self.viewpoints = [
+            *self._planned([v for v in plan if v.name not in done]),
+            *(v for v in plan if v.name in done),
+        ]
+
+    def _planned(self, viewpoints: Sequence[Viewpoint]) -> tuple[Viewpoint, ...]:
+        """Plan the motions from where the arms stand; the viewpoints in the planned order."""
+        planned = plan_step(self._context, viewpoints, self._nominal, self._order)
+        self._refused, self._stands_rad = planned.refused, dict(planned.starts_rad)
+        return planned.viewpoints
 
     def take(self, viewpoints: Sequence[Viewpoint], again: Collection[str]) -> CaptureTotals:
         """Capture those viewpoints that have no image, and those whose image (SHA-256) is to be taken again."""
@@ -136,7 +144,7 @@ class _Capture:
                 why = spoilt.get(capture.artefacts[0].sha256)
                 if why is not None:
                     self._context.tell(f"{capture.viewpoint}: {why}; it is taken again")
-            repeated = self.take(self.of_images(spoilt), spoilt)
+            repeated = self.take(self._planned(self.of_images(spoilt)), spoilt)
             totals = replace(repeated, planned=totals.planned, given_up=totals.given_up)
             spoilt = live.spoilt()
         live.note_spoilt(spoilt)
