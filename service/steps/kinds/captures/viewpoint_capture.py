@@ -94,7 +94,8 @@ class _Capture:
     """The viewpoints of one execution of the step, and what is computed while they are captured."""
 
     def __init__(self, context: StepContext, params: Params, again: Collection[str]) -> None:
-        self._context, self._purpose, self._order = context, params.purpose, params.order
+        self._context, self._purpose = context, params.purpose
+        self._order: Order = params.order
         plan = [
             viewpoint
             for viewpoint_set in params.viewpoints
