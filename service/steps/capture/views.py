@@ -268,11 +268,16 @@ class _CaptureLoop:
             target = self._solve(robot, viewpoint)
         motion = context.protocol.motion
         limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
-        for joints_rad in (*self._detour(robot, viewpoint), target):
-            settled = move_and_settle(
-                context, robot, joints_rad, limits, settle_criteria(context), meanwhile=self.keep
-            )
+        criteria = settle_criteria(context)
+
+        def move(joints_rad: Array) -> SettleReport:
+            settled = move_and_settle(context, robot, joints_rad, limits, criteria, meanwhile=self.keep)
             self._require_there(robot, name, settled.joints_rad, joints_rad)
+            return settled
+
+        for joints_rad in self._detour(robot, viewpoint):
+            move(joints_rad)
+        settled = move(target)
         self.task.stands_rad[viewpoint.station] = target
         return settled
 
