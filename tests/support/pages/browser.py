@@ -50,9 +50,14 @@ _RULES = {
 }
 
 
+#: How long a page may take for anything that a test waits for: on a busy machine, and where it makes a scene first.
+PATIENCE_MS = 60_000
+
+
 @contextmanager
 def chromium() -> Generator[Browser]:
     """The system's Chromium, headless."""
+    expect.set_options(timeout=PATIENCE_MS)
     path = next((found for name in _NAMES if (found := shutil.which(name))), None)
     if path is None:
         pytest.fail(
@@ -225,7 +230,7 @@ class Screen:
     def hold(self, name: str, seconds: float = 1.8) -> None:
         """Press the button of that name and hold it."""
         button = self.page.get_by_role("button", name=name)
-        expect(button).to_be_enabled(timeout=20_000)
+        expect(button).to_be_enabled()
         button.scroll_into_view_if_needed()
         button.hover()
         self.page.mouse.down()
@@ -246,8 +251,7 @@ def screen(
     )
     complaints: list[str] = []
     page = context.new_page()
-    page.set_default_timeout(15_000)
-    page.set_default_navigation_timeout(60_000)  # a page with a scene is made when it is first asked for
+    page.set_default_timeout(PATIENCE_MS)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on(
         "console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None
