@@ -15,14 +15,13 @@ from simulators.canon_camera.properties import (
 )
 from simulators.faults import FaultPlan
 from simulators.still_camera.body import BodyOptions, CameraBody, CameraFile, FileNames
+from simulators.still_camera.card import FOLDER_PICTURES, STORAGE
 from simulators.still_camera.exif import ExposureSettings, Nameplate
 from simulators.still_camera.scene import ImageSource
 
 MODEL, SERIAL, LENS = "Canon EOS R5", "042021006092", "RF24-70mm F2.8 L IS USM"
 PLATE = Nameplate("Canon", MODEL, LENS, SERIAL, "Firmware Version 1.8.2", sub_second_digits=2)
 FORMAT_CR3 = 0xB108
-STORAGE, FOLDER_DCIM, FOLDER_PICTURES = 0x00010001, 0x30000000, 0x30100000
-FOLDERS = {FOLDER_DCIM: ("DCIM", 0), FOLDER_PICTURES: ("100EOSR5", FOLDER_DCIM)}
 PICTURE_BYTES = 30_000_000  # by which the remaining pictures are counted
 _IN_MEMORY = 0x40000000
 _PROTOCOL_ISO = 100

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from simulators.canon_camera.body import (
-    FOLDER_DCIM,
-    FOLDER_PICTURES,
-    FOLDERS,
-    FORMAT_CR3,
-    MODEL,
-    STORAGE,
-    CanonBody,
-)
+from simulators.canon_camera.body import FORMAT_CR3, MODEL, CanonBody
 from simulators.canon_camera.events import Event
 from simulators.canon_camera.properties import MEMORY, Code
 from simulators.faults import FaultPlan
@@ -21,16 +13,15 @@ from simulators.ptpip.reply import (
     GENERAL_ERROR,
     INVALID_HANDLE,
     INVALID_PARAMETER,
-    INVALID_STORAGE,
     SESSION_NOT_OPEN,
     Reply,
 )
-from simulators.still_camera.body import CARD_BYTES, FORMAT_JPEG
+from simulators.still_camera.body import FORMAT_JPEG
+from simulators.still_camera.card import STORAGE, CardOperations
 from simulators.still_camera.operations import Operation, Operations, accept
 
 VENDOR = 0x0B
 _ASSOCIATION = 0x3001
-_ROOT = 0xFFFFFFFF
 _HALF, _FULL = 1, 2
 _VIEWFINDER_TO_COMPUTER = 2
 _NOT_READY = 0xA102
@@ -44,18 +35,19 @@ class CanonResponder(Operations):
     def __init__(self, body: CanonBody, faults: FaultPlan) -> None:
         self._body = body
         self._remote = False
+        card = CardOperations(body, "100EOSR5", "CFexpress")
         operations: dict[int, tuple[str, Operation]] = {
             0x1001: ("get_device_info", self._device_info),
             0x1002: ("open_session", self._open_session),
             0x1003: ("close_session", accept),
             0x1004: ("get_storage_ids", self._storage_ids),
-            0x1005: ("get_storage_info", self._storage_info),
-            0x1007: ("get_object_handles", self._object_handles),
-            0x1008: ("get_object_info", self._object_info),
-            0x1009: ("get_object", self._object),
+            0x1005: ("get_storage_info", card.storage_info),
+            0x1007: ("get_object_handles", card.object_handles),
+            0x1008: ("get_object_info", card.object_info),
+            0x1009: ("get_object", card.object),
             0x101B: ("get_object", self._partial_object),
             0x9101: ("get_eos_storage_ids", self._storage_ids),
-            0x9102: ("get_eos_storage_info", self._storage_info),
+            0x9102: ("get_eos_storage_info", card.storage_info),
             0x9108: ("get_eos_device_info", self._eos_device_info),
             0x9110: ("set", self._set),
             0x9114: ("set_remote_mode", self._set_remote_mode),
@@ -108,45 +100,6 @@ class CanonResponder(Operations):
     def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
         return Reply(data=codec.array_u32((STORAGE,) if self._body.has_card else ()))
-
-    def _storage_info(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        if request.parameters[:1] != (STORAGE,):
-            return Reply(INVALID_STORAGE)
-        free = self._body.free_bytes
-        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000, "CFexpress").encode())
-
-    def _object_handles(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        parent = request.parameters[2] if len(request.parameters) > 2 else 0
-        inside: dict[int, tuple[int, ...]] = {
-            _ROOT: (FOLDER_DCIM,),
-            FOLDER_DCIM: (FOLDER_PICTURES,),
-            FOLDER_PICTURES: self._body.on_card(),
-            0: (*FOLDERS, *self._body.on_card()),
-        }
-        return Reply(data=codec.array_u32(inside[parent])) if parent in inside else Reply(INVALID_HANDLE)
-
-    def _object_info(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        handle = request.parameters[0] if request.parameters else 0
-        if handle in FOLDERS:
-            name, parent = FOLDERS[handle]
-            info = codec.ObjectInfo(STORAGE, _ASSOCIATION, 0, 0, 0, name, "", parent, folder=True)
-            return Reply(data=info.encode())
-        file = self._body.file(handle)
-        if file is None:
-            return Reply(INVALID_HANDLE)
-        size = len(file.data)
-        info = codec.ObjectInfo(
-            STORAGE, file.format, size, file.width, file.height, file.name, file.captured, FOLDER_PICTURES
-        )
-        return Reply(data=info.encode())
-
-    def _object(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        file = self._body.file(request.parameters[0] if request.parameters else 0)
-        return Reply(INVALID_HANDLE) if file is None else Reply(data=file.data)
 
     def _partial_object(self, request: codec.Request, data: bytes) -> Reply:
         del data

@@ -11,13 +11,12 @@ from simulators.faults import FaultPlan
 from simulators.sony_camera.properties import CameraProperty
 from simulators.sony_camera.recorded import table_of
 from simulators.still_camera.body import BodyOptions, CameraBody, CameraFile, FileNames
+from simulators.still_camera.card import FOLDER_PICTURES
 from simulators.still_camera.exif import ExposureSettings, Nameplate
 from simulators.still_camera.operations import NotWritableError
 from simulators.still_camera.scene import ImageSource
 
 FORMAT_NEF = 0x3000
-STORAGE, FOLDER_DCIM, FOLDER_PICTURES = 0x00010001, 0x30000000, 0x30100000
-FOLDERS = {FOLDER_DCIM: ("DCIM", 0), FOLDER_PICTURES: ("100NZ___", FOLDER_DCIM)}
 COMPRESSION, F_NUMBER, ISO, EXPOSURE_TIME = 0x5004, 0x5007, 0x500F, 0xD100
 _RAW, _BOTH = (4,), (5, 6, 7)  # compressions
 _FOLDER = Path(str(resources.files("simulators.nikon_camera"))) / "recordings"

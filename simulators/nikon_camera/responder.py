@@ -5,17 +5,18 @@ from __future__ import annotations
 import struct
 
 from simulators.faults import FaultPlan
-from simulators.nikon_camera.body import FOLDER_DCIM, FOLDER_PICTURES, FOLDERS, FORMAT_NEF, STORAGE, NikonBody
+from simulators.nikon_camera.body import FORMAT_NEF, NikonBody
 from simulators.ptpip import codec
-from simulators.ptpip.reply import DEVICE_BUSY, INVALID_HANDLE, INVALID_STORAGE, OK, Reply
+from simulators.ptpip.reply import DEVICE_BUSY, OK, Reply
 from simulators.sony_camera.properties import TEXT, CameraProperty, Enabled
-from simulators.still_camera.body import CARD_BYTES, FORMAT_JPEG
+from simulators.still_camera.body import FORMAT_JPEG
+from simulators.still_camera.card import STORAGE, CardOperations
 from simulators.still_camera.operations import NotWritableError, Operation, Operations, accept
 
 VENDOR = 0x0A
 OBJECT_ADDED = 0x4002
 NO_SUCH_PROPERTY = 0x200A
-_ASSOCIATION, _ROOT = 0x3001, 0xFFFFFFFF
+_ASSOCIATION = 0x3001
 _VENDORS_FROM = 0xD000
 
 
@@ -24,15 +25,16 @@ class NikonResponder(Operations):
 
     def __init__(self, body: NikonBody, faults: FaultPlan) -> None:
         self._body = body
+        card = CardOperations(body, "100NZ___", "XQD")
         operations: dict[int, tuple[str, Operation]] = {
             0x1001: ("get_device_info", self._device_info),
             0x1002: ("open_session", accept),
             0x1003: ("close_session", accept),
             0x1004: ("get_storage_ids", self._storage_ids),
-            0x1005: ("get_storage_info", self._storage_info),
-            0x1007: ("get_object_handles", self._object_handles),
-            0x1008: ("get_object_info", self._object_info),
-            0x1009: ("get_object", self._object),
+            0x1005: ("get_storage_info", card.storage_info),
+            0x1007: ("get_object_handles", card.object_handles),
+            0x1008: ("get_object_info", card.object_info),
+            0x1009: ("get_object", card.object),
             0x1014: ("describe", self._describe),
             0x1015: ("tell", self._tell),
             0x1016: ("set", self._set),
@@ -110,45 +112,6 @@ class NikonResponder(Operations):
     def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
         return Reply(data=codec.array_u32((STORAGE,)))
-
-    def _storage_info(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        if request.parameters[:1] != (STORAGE,):
-            return Reply(INVALID_STORAGE)
-        free = self._body.free_bytes
-        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000, "XQD").encode())
-
-    def _object_handles(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        parent = request.parameters[2] if len(request.parameters) > 2 else 0
-        inside: dict[int, tuple[int, ...]] = {
-            _ROOT: (FOLDER_DCIM,),
-            FOLDER_DCIM: (FOLDER_PICTURES,),
-            FOLDER_PICTURES: self._body.on_card(),
-            0: (*FOLDERS, *self._body.on_card()),
-        }
-        return Reply(data=codec.array_u32(inside[parent])) if parent in inside else Reply(INVALID_HANDLE)
-
-    def _object_info(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        handle = request.parameters[0] if request.parameters else 0
-        if handle in FOLDERS:
-            name, parent = FOLDERS[handle]
-            info = codec.ObjectInfo(STORAGE, _ASSOCIATION, 0, 0, 0, name, "", parent, folder=True)
-            return Reply(data=info.encode())
-        file = self._body.file(handle)
-        if file is None:
-            return Reply(INVALID_HANDLE)
-        size = len(file.data)
-        info = codec.ObjectInfo(
-            STORAGE, file.format, size, file.width, file.height, file.name, file.captured, FOLDER_PICTURES
-        )
-        return Reply(data=info.encode())
-
-    def _object(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        file = self._body.file(request.parameters[0] if request.parameters else 0)
-        return Reply(INVALID_HANDLE) if file is None else Reply(data=file.data)
 
 
 def described(entry: CameraProperty) -> bytes:
