@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -110,7 +110,7 @@ class CtReading:
 
     def device(self, folder: Path) -> dict[str, Any]:
         """The section of the device that reads a folder so."""
-        given = {name: value for name, value in asdict(self).items() if value != getattr(CtReading(), name)}
+        given = {one.name: value for one in fields(self) if (value := getattr(self, one.name)) != one.default}
         return {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0, **given}
 
 

@@ -34,7 +34,6 @@ from drivers.interfaces import (
 from drivers.meshes.export_watch import ExportWatch
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.scan_folder import free_bytes, require_folder
-from service.core.units import seconds_of_ns
 
 _ARRIVING = "still arriving"
 _Headers = tuple[SliceHeader, ...] | str  # of one file; or why it cannot be read
@@ -193,7 +192,7 @@ class DicomFolder:
             for uid, headers in self._groups().items()
             if headers[0].modality != SEGMENTATION
         ]
-        return tuple(sorted(found, key=lambda one: (one.modified_utc, one.uid)))
+        return tuple(sorted(found, key=lambda one: (self._arrivals[one.uid].newest_ns, one.uid)))
 
     def _is_wanted(self, series: CtSeries) -> bool:
         return self._config.series.casefold() in series.description.casefold()
@@ -274,12 +273,7 @@ class DicomFolder:
             problems=arriving + self._problems(headers),
             frame_of_reference=headers[0].frame_of_reference,
             acquired_images=acquired_images(headers),
-            modified_utc=self._modified_utc(uid),
         )
-
-    def _modified_utc(self, uid: str) -> str:
-        arrival = self._arrivals.get(uid)
-        return "" if arrival is None else _utc(arrival.newest_ns)
 
     def _identity(self) -> DeviceIdentity:
         return DeviceIdentity(
@@ -299,9 +293,5 @@ def _key(path: Path) -> _FileKey:
 
 
 def _segmentation(path: Path) -> ScanExport:
-    return ScanExport(path.name, (path,), _utc(path.stat().st_mtime_ns))
-
-
-def _utc(modified_ns: int) -> str:
-    moment = datetime.fromtimestamp(seconds_of_ns(modified_ns), UTC)
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    modified = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat().replace("+00:00", "Z")
+    return ScanExport(path.name, (path,), modified)

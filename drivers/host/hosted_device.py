@@ -5,6 +5,7 @@ It contains native crashes of vendor libraries.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import socket
@@ -26,7 +27,6 @@ from drivers.errors import (
     DriverKilledError,
     MachineBusyError,
 )
-from drivers.host.child_log import LOG, pass_on
 from drivers.host.doing import MOST_ENDS, Note
 from drivers.host.heartbeat import CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S, Line
 from drivers.interfaces import DeviceIdentity
@@ -34,6 +34,10 @@ from drivers.machine_pressure import HeldUp, killed_for_memory
 from drivers.plugin import READING_TIMEOUT_S
 from service.core.errors import OrthocaptureError
 
+_LOG = logging.getLogger("drivers.host")
+_LEVELS = logging.getLevelNamesMapping()
+# What other libraries than the driver's own package log in a child is for the log file, not for people.
+_OURS = frozenset({"drivers", "service", "root"})
 T = TypeVar("T")
 # The driver's process died, did not answer, or has told that the device does not.
 Ending = Literal["died", "stalled", "broken"]
@@ -186,7 +190,7 @@ class HostedDevice:
                     again = (attempt == 0 and not fresh) or (self._crashed and bool(self._note.read()))
                     if attempt == MOST_ENDS or not again:
                         raise
-                    LOG.warning("%s: %s; trying once more", self._name, error)
+                    _LOG.warning("%s: %s; trying once more", self._name, error)
                     self._start()
                 else:
                     self._opened = True
@@ -201,7 +205,7 @@ class HostedDevice:
             try:
                 self._exchange("close", (), {}, CLOSE_TIMEOUT_S)
             except DeviceError as error:
-                LOG.warning("%s: closing: %s", self._name, error)
+                _LOG.warning("%s: closing: %s", self._name, error)
             self._bury()
             self._obituary, self._killed = "closed", False
         self._watch_stop.set()
@@ -326,7 +330,7 @@ class HostedDevice:
         finally:
             theirs.close()
         package = self._spec_path.partition(".")[0].partition(":")[0]
-        reader = threading.Thread(target=pass_on, args=(process, self._name, package), daemon=True)
+        reader = threading.Thread(target=_pass_on, args=(process, self._name, package), daemon=True)
         reader.start()
         self._child = _Child(process, Line(Connection(ours.detach())), reader)
         self._suspect = False
@@ -363,7 +367,7 @@ class HostedDevice:
             self._obituary += f" in {self._method}{self._doing()}" if self._method else ""
             self._note.count_end()
         if status != 0:
-            LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
+            _LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
         self._watch_stop.set()
         return opened
 
@@ -376,7 +380,7 @@ class HostedDevice:
                 if not stop.is_set():
                     self._exchange("", (), {}, PING_TIMEOUT_S)
             except DeviceError as error:
-                LOG.error("%s: heartbeat: %s", self._name, error)
+                _LOG.error("%s: heartbeat: %s", self._name, error)
                 return
             finally:
                 self._lock.release()
@@ -395,3 +399,16 @@ def _stalled(method: str, timeout_s: float, lost_s: float, name: str, doing: str
     return DeviceTimeoutError(
         f"{said}; its process was ended", where=name, remedy="Check the device and its cable, then open it again"
     )
+
+
+def _pass_on(process: Popen[str], name: str, package: str) -> None:
+    """Log each line that the process writes, until it ends; `package` is that of its driver."""
+    log = logging.getLogger(f"{_LOG.name}.{name}")
+    assert process.stdout is not None
+    for line in process.stdout:
+        level, separator, message = line.rstrip().partition("|")
+        if separator and level in _LEVELS:
+            ours = message.partition(":")[0].partition(".")[0] in _OURS | {package}
+            log.log(_LEVELS[level] if ours else min(_LEVELS[level], logging.INFO), "%s", message)
+        elif line.strip():
+            log.info("%s", line.rstrip())

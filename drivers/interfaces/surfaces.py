@@ -70,7 +70,6 @@ class CtSeries:
     acquired_images: int | None = (
         None  # of its acquisition, as the files state: more than slices if it has other series
     )
-    modified_utc: str = ""  # when the newest of its files was written, by the clock of the folder
 
 
 @dataclass(frozen=True, slots=True)

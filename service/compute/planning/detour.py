@@ -26,16 +26,17 @@ class Freedom:
     obstacles: Obstacles
     margin_m: float
 
-    def is_free(self, joints_rad: Array) -> bool:
-        """Whether it keeps clear at all of the joints (K, N)."""
+    def obstruction(self, joints_rad: Array) -> str:
+        """What it would come too near to at the worst of the joints (K, N), in words; "" if it keeps clear."""
         if not len(joints_rad):
-            return True
+            return ""
         contacts = nearest_contacts(self.body, self.obstacles, joints_rad)
-        return min(contact.clearance_m for contact in contacts) >= self.margin_m
+        worst = min(contacts, key=lambda contact: contact.clearance_m)
+        return str(worst) if worst.clearance_m < self.margin_m else ""
 
-    def is_open(self, start_rad: Array, end_rad: Array) -> bool:
-        """Whether the straight way between two joints (N,) is free. The ends themselves are not looked at."""
-        return self.is_free(straight_path(start_rad, end_rad, PATH_STEP_RAD)[1:-1])
+    def obstruction_between(self, start_rad: Array, end_rad: Array) -> str:
+        """What blocks the straight way between two joints (N,). The ends are free, or the arm is there already."""
+        return self.obstruction(straight_path(start_rad, end_rad, PATH_STEP_RAD)[1:-1])
 
 
 def detour(start_rad: Array, end_rad: Array, freedom: Freedom) -> Array | None:
@@ -78,7 +79,7 @@ class _Tree:
         parent = self._nearest(towards_rad)
         there = self._reached(parent, towards_rad)
         way = straight_path(self.joints_rad[parent], there, PATH_STEP_RAD)[1:]
-        return self._grown(there, parent) if freedom.is_free(way) else None
+        return None if freedom.obstruction(way) else self._grown(there, parent)
 
     def meet(self, joints_rad: Array, freedom: Freedom) -> int | None:
         """Grow branch by branch as far as the joints (N,) of the other tree; their index here, None if blocked."""
@@ -88,7 +89,7 @@ class _Tree:
             arrives = np.array_equal(there, joints_rad)
             # The other tree's joints are known to be free, or one of the ends, which are not looked at.
             way = straight_path(self.joints_rad[at], there, PATH_STEP_RAD)[1 : -1 if arrives else None]
-            if not freedom.is_free(way):
+            if freedom.obstruction(way):
                 return None
             at = self._grown(there, at)
             if arrives:
@@ -123,6 +124,6 @@ def _shortened(way: Array, freedom: Freedom, rng: np.random.Generator) -> Array:
             return way
         i = int(rng.integers(0, len(way) - 2))
         j = int(rng.integers(i + 2, len(way)))
-        if freedom.is_open(way[i], way[j]):
+        if not freedom.obstruction_between(way[i], way[j]):
             way = np.concatenate([way[: i + 1], way[j:]])
     return way

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 
 from service.compute.arm.inverse_kinematics import postures_near
-from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts, straight_path
-from service.compute.planning.detour import PATH_STEP_RAD, Freedom, detour
+from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts
+from service.compute.planning.detour import Freedom, detour
 from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
 
@@ -43,6 +43,11 @@ class PlanningScene:
     sharp: DepthOfField | None = None
     must_be_sharp_m: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)  # (N, 3) points
     pause_s: float = 0.0  # at each viewpoint
+
+    @property
+    def freedom(self) -> Freedom:
+        """Where the arm may be."""
+        return Freedom(self.body, self.obstacles, self.margin_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +119,7 @@ def plan_motion(
     total, vain = 0.0, 0
     for number, i in enumerate(sequence):
         progress("checking the way between the viewpoints", number, len(able))
-        blocked = _blocked(here, able[i].joints_rad, scene)
+        blocked = scene.freedom.obstruction_between(here, able[i].joints_rad)
         free = _other_way(here, able[i], scene) if blocked else None
         if free is not None:
             able[i], blocked = replace(able[i], joints_rad=free), ""
@@ -300,24 +305,13 @@ def best_posture(T_base_camera: Transform, scene: PlanningScene) -> Array | None
 def _other_way(here: Array, view: PlannedView, scene: PlanningScene) -> Array | None:
     """Joints (N,) of another posture for a view that can be reached straight from `here`; None if there is none."""
     others = islice(able_postures(view.T_base_camera, scene), 1, _MOST_WAYS)
-    return next((q for q in others if not _blocked(here, q, scene)), None)
+    return next((q for q in others if not scene.freedom.obstruction_between(here, q)), None)
 
 
 def _round_about(here: Array, view: PlannedView, scene: PlanningScene) -> PlannedView:
     """The view with a detour from `here`, in the first of its postures to which one is found; else as it is."""
-    freedom = Freedom(scene.body, scene.obstacles, scene.margin_m)
     for joints_rad in islice(able_postures(view.T_base_camera, scene), _ROUND_POSTURES):
-        between = detour(here, joints_rad, freedom)
+        between = detour(here, joints_rad, scene.freedom)
         if between is not None:
             return replace(view, joints_rad=joints_rad, way_rad=np.concatenate([here[None], between]))
     return view
-
-
-def _blocked(here: Array, there: Array, scene: PlanningScene) -> str:
-    # Both ends are free, or the arm is there already.
-    way = straight_path(here, there, PATH_STEP_RAD)[1:-1]
-    if not len(way):
-        return ""
-    contacts = nearest_contacts(scene.body, scene.obstacles, way)
-    worst = min(contacts, key=lambda contact: contact.clearance_m)
-    return str(worst) if worst.clearance_m < scene.margin_m else ""

@@ -278,7 +278,7 @@ class BoardCapture:
 
     def _capture(self, poses: Sequence[Viewpoint]) -> None:
         again = to_take_again(self.context)
-        done = taken_for_good(self.context, again)
+        done = taken_for_good(self.context.evidence.captures(self.context.step.id), again)
         todo = [v for v in poses if v.name not in done]
         refused: Mapping[str, str] = {}
         stands_rad: dict[str, Array] = {}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from service.core.gates.verdict import describe, evaluate_gates
+from service.core.records.events import RecordedView
 from service.steps.capture.spoilt import CLEAN, spoilt_before
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING, images_to_repeat
@@ -32,12 +33,12 @@ def to_take_again(context: StepContext) -> set[str]:
     return departing | spoilt_before(context)
 
 
-def taken_for_good(context: StepContext, again: Collection[str]) -> set[str]:
-    """The viewpoints that need no image any more: theirs is as required, and is not one of `again` (SHA-256).
+def taken_for_good(captures: Iterable[RecordedView], again: Collection[str]) -> set[str]:
+    """The viewpoints that need no image any more: their newest is as required, and not one of `again` (SHA-256).
 
     All others are reached by a motion, so they belong to the plan.
     """
-    newest = {capture.viewpoint: capture for capture in context.evidence.captures(context.step.id)}
+    newest = {capture.viewpoint: capture for capture in captures}
     return {
         name
         for name, capture in newest.items()

@@ -37,6 +37,7 @@ from service.steps.capture.exposure import (
 from service.steps.capture.further_cameras.images import exposing_at, settings_of
 from service.steps.capture.motion import MotionLimits, move_and_settle, require_there, settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
+from service.steps.capture.retakes import taken_for_good
 from service.steps.context import FurtherCamera, StepContext
 
 #: Errors after which a viewpoint is tried again with the device reopened; a DriverKilledError among them is not.
@@ -191,10 +192,8 @@ class _CaptureLoop:
 
         An image whose verdicts failed is taken again, once per execution.
         """
-        captures = {capture.viewpoint: capture for capture in self.context.evidence.captures(self.context.step.id)}
-        old = {name for name, capture in captures.items() if capture.artefacts[0].sha256 in self.task.again}
-        good = {name for name, c in captures.items() if all(c.verdicts.values())} - old
-        done = good | (self._tried & captures.keys())
+        captures = self.context.evidence.captures(self.context.step.id)
+        done = taken_for_good(captures, self.task.again) | (self._tried & {one.viewpoint for one in captures})
         if self._held is not None:
             done.add(self._held.viewpoint.name)
         left = [v for v in self.task.viewpoints if v.name not in done and v.name not in self.given_up]

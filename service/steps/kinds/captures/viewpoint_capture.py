@@ -109,7 +109,7 @@ class _Capture:
             plan += [viewpoint for viewpoint in self._extra if viewpoint.name in wanted]
         context.devices.camera()  # before planning: without a camera no plan is needed
         self._nominal = context.devices.nominal_T_flange_camera()
-        done = taken_for_good(context, again)
+        done = taken_for_good(context.evidence.captures(context.step.id), again)
         self._features = EarlyFeatures.begin(context, plan)
         self.viewpoints = [
             *self._planned([v for v in plan if v.name not in done]),
