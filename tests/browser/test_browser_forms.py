@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -61,6 +61,20 @@ def next_image(server: Served, run_id: str, name: str) -> None:
         capture(web, run_id, "capture", name, EYE, shade=int(name[-1]))
 
 
+@contextmanager
+def scripts_held_back(tablet: Screen) -> Generator[Callable[[], None]]:
+    """Keep the page's scripts on their way, as a slow network does, until what is yielded is called."""
+    waiting: list[Route] = []
+    tablet.page.route("**/*.js", lambda route: waiting.append(route))  # noqa: PLW0108 - the library marks its handlers
+
+    def come() -> None:
+        while waiting:
+            waiting.pop().continue_()
+        tablet.page.unroute("**/*.js")
+
+    yield come
+
+
 def open_redo_with_a_reason(page: Page) -> None:
     page.get_by_text("Redo v1_001…").click()
     page.get_by_label("Reason in your own words").fill("a drape hung into it")
@@ -84,6 +98,38 @@ def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Serv
         assert (redo.viewpoint, redo.reason) == ("v1_001", "a drape hung into it")
         page.get_by_text("Redo v1_002…").click()
         expect(page.get_by_label("Reason in your own words")).to_have_value("")
+
+
+@pytest.mark.slow
+def test_what_was_typed_before_the_scripts_had_come_counts(server: Served, browser: Browser) -> None:
+    with capturing(server, browser) as (tablet, run_id), scripts_held_back(tablet) as come:
+        page = tablet.page
+        page.reload(wait_until="commit")
+        open_redo_with_a_reason(page)
+        come()
+        button = page.get_by_role("button", name="Redo v1_001")
+        button.focus()
+        page.keyboard.down("Enter")
+        expect(page.locator("details[open] form")).to_have_count(0, timeout=LATER_MS)
+        page.keyboard.up("Enter")
+        assert [act.reason for act in acts(server, run_id) if act.action == "redo"] == ["a drape hung into it"]
+
+
+@pytest.mark.slow
+def test_no_tap_sends_what_must_be_held_before_the_scripts_have_come(server: Served, browser: Browser) -> None:
+    with at_the_table(server, browser) as (tablet, run_id):
+        record(server, run_id, skip("fixation"))
+        page = tablet.page
+        go = page.get_by_role("button", name="Confirm: the robot takes 4 images")
+        expect(go).to_be_enabled(timeout=LATER_MS)
+        with scripts_held_back(tablet) as come:
+            page.reload(wait_until="commit")
+            go.click()
+            page.wait_for_timeout(500)
+            assert [act.action for act in acts(server, run_id) if act.action == "confirm"] == []
+            come()
+        expect(go).to_be_enabled(timeout=LATER_MS)
+        assert [act.action for act in acts(server, run_id) if act.action == "confirm"] == []
 
 
 @pytest.mark.slow

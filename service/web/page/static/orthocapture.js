@@ -85,7 +85,7 @@
     return [...fresh.content.children].map((each) => [parts.get(each.dataset.part), each]);
   }
   function showPart(part, fresh) {
-    for (const without of fresh.content.querySelectorAll("noscript")) without.replaceChildren(); // a template shows it
+    holdInstead(fresh.content);
     merging.mergeChildren(part, fresh.content);
     part.dispatchEvent(new CustomEvent("part-changed", { bubbles: true }));
   }
@@ -197,6 +197,11 @@
 
   // --- hold to confirm -------------------------------------------------------------------------------------------
 
+  // Until this script has come, and where it never does, a box to tick stands before what a mere tap would send.
+  function holdInstead(where) {
+    for (const box of where.querySelectorAll("[data-instead-of-hold]")) box.remove();
+  }
+  holdInstead(document);
   let held = null; // {button, from, need, frame, key}
   const still = matchMedia("(prefers-reduced-motion: reduce)");
   function startHold(button, key) {

@@ -9,12 +9,18 @@
     const words = form.querySelector("textarea[name=reason]");
     words.required = form.querySelector("input[name=preset]:checked")?.hasAttribute("data-own") || false;
   }
-  document.addEventListener("input", (event) => {
-    const form = event.target.form;
-    if (!reasonsOf(form) || event.target.name !== "reason") return;
+  function chooseOwnWords(form) {
     if (!form.querySelector("input[name=preset]:checked")) form.querySelector("[data-own]").checked = true;
     demandWords(form);
+  }
+  document.addEventListener("input", (event) => {
+    const { form, name } = event.target;
+    if (reasonsOf(form) && name === "reason") chooseOwnWords(form);
   });
+  // What was typed before this script had come.
+  for (const words of document.querySelectorAll("textarea[name=reason]")) {
+    if (words.value && reasonsOf(words.form)) chooseOwnWords(words.form);
+  }
 
   // --- password, PIN or badge ---
 
