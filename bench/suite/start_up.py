@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
+from drivers.host.doing import Note
 from drivers.ur import UrConfig
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
@@ -70,18 +71,19 @@ def until_ready_s(words: Sequence[str]) -> float:
 def driver_host_s() -> float:
     """CPU seconds of a driver's process with an arm's driver in it, as the station starts one."""
     ours, theirs = socket.socketpair()
-    words = (sys.executable, "-m", "drivers.host", str(theirs.fileno()))
+    note = Note()
+    words = (sys.executable, "-m", "drivers.host", str(theirs.fileno()), str(note.descriptor))
     process = subprocess.Popen(
         words,
         cwd=REPOSITORY,
         env=_environment(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        pass_fds=[theirs.fileno()],
+        pass_fds=[theirs.fileno(), note.descriptor],
     )
     theirs.close()
     with Connection(ours.detach()) as line:
-        line.send((1, "start", ("drivers.ur:DRIVER", UrConfig(host="127.0.0.1").model_dump_json(), 60.0), {}))
+        line.send((1, "start", ("drivers.ur:DRIVER", UrConfig(host="127.0.0.1").model_dump_json(), 60.0, note.left_out), {}))
         _sequence, well, answer = line.recv()
         if not well:
             raise answer
