@@ -83,7 +83,9 @@ def driver_host_s() -> float:
     )
     theirs.close()
     with Connection(ours.detach()) as line:
-        line.send((1, "start", ("drivers.ur:DRIVER", UrConfig(host="127.0.0.1").model_dump_json(), 60.0, note.left_out), {}))
+        line.send(
+            (1, "start", ("drivers.ur:DRIVER", UrConfig(host="127.0.0.1").model_dump_json(), 60.0, note.left_out), {})
+        )
         _sequence, well, answer = line.recv()
         if not well:
             raise answer
