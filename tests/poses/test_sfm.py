@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, reconstruct_from
+from service.compute.poses.sfm.extraction import extract_sift
 from service.compute.poses.sfm.features import ImageFeatures, pack_matches, unpack_matches
 from service.compute.poses.sfm.front_end import FrontEnd, missing_pairs
 from service.compute.poses.sfm.options import SfmOptions
@@ -172,6 +173,23 @@ def test_rough_metric_poses_are_triangulated_and_adjusted(
     assert adjusted[-1][0] == adjusted[-1][1]
     with pytest.raises(ComputeError, match="initial poses"):
         reconstruct(images, SfmWorkspace(tmp_path / "work", camera, OPTIONS), "triangulated")
+
+
+def test_of_too_many_features_most_are_small_and_some_are_large() -> None:
+    noise = np.random.default_rng(1).normal(size=(480, 640))
+    picture = sum(sigma * cv2.GaussianBlur(noise, (0, 0), sigma) for sigma in (1.5, 4.0, 10.0))
+    grey = np.clip(128 + 60 * picture, 0, 255).astype(np.uint8)
+    every = extract_sift(grey, 100_000, 0)
+    few = extract_sift(grey, 300, 0)
+    assert len(few.points) == 300
+    ordered = np.sort(every.scales_px)[::-1]
+    found = np.sort(few.scales_px)[::-1]
+    # The largest 37 of all, for images from other distances; the others are far below the 300 largest.
+    np.testing.assert_allclose(found[:37], ordered[:37], rtol=1e-6)
+    assert np.median(found[37:]) < ordered[300]
+    rows = [np.flatnonzero((every.points == point).all(axis=1)) for point in few.points[:20]]
+    for row, descriptor in zip(rows, few.descriptors[:20], strict=True):
+        assert any((every.descriptors[k] == descriptor).all() for k in row)
 
 
 def test_damaged_pieces_are_refused() -> None:

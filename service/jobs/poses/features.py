@@ -43,6 +43,7 @@ KIND = JobKind(
     answer=NoAnswer,
     compute="service.worker.poses.front_end:features",
     words="features of the images",
+    version=3,  # of too many, those with small scales are kept
     order=40,
     aside=True,
     demand=lambda arguments: Demand(memory_mb=1100, limit_s=3600 + 300 * len(arguments.images)),

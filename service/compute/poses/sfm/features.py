@@ -32,7 +32,7 @@ _DAMAGED = (ValueError, KeyError, TypeError, IndexError, OSError, EOFError, Runt
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFeatures:
-    """SIFT features of one image, those with the largest scales.
+    """SIFT features of one image (extraction.py says which, if there are too many).
 
     Attributes:
         width, height: of the image as captured, px.

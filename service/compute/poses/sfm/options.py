@@ -19,7 +19,7 @@ class SfmOptions:
 
     Attributes:
         max_image_size: longer side to which images are reduced for feature extraction; 0 keeps the full size.
-        max_features: per image, the largest scales first.
+        max_features: most per image; most of them are those with the smallest scales (`extract_sift`).
         first_octave: -1 doubles the image first (finer and four times slower), 0 does not.
         neighbours: number of images, nearest in viewing direction, with which each image is matched (needs a prior).
         max_angle_deg: largest angle between two matched views, as seen from the scene.
