@@ -52,6 +52,7 @@ PLACES = {
     "service/audit/verify/verifications.py": _STAMP,
     "service/benchmark/shared_parts.py": "the newest of several files",
     "service/cli/evidence/runs.py": "days that a person asks for",
+    "service/cli/site/record_devices.py": _STAMP,
     "service/cli/site/serve.py": _STAMP,
     "service/compute/poses/sfm/kept.py": _CHANGE,
     "service/core/equipment/clocks.py": "offsets of cameras' clocks within one process, which are shown",

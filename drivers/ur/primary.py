@@ -40,6 +40,10 @@ class ControllerKinematics:
     d_m: tuple[float, ...]
     alpha_rad: tuple[float, ...]
 
+    def fields(self) -> dict[str, tuple[float, ...]]:
+        """The parameters by name."""
+        return {"theta_rad": self.theta_rad, "a_m": self.a_m, "d_m": self.d_m, "alpha_rad": self.alpha_rad}
+
     def departure_m(self, published: ArmModel, joints_rad: Array) -> float:
         """How far it has the flange from where the published dimensions put it."""
         own = replace(published, a_m=np.array(self.a_m), d_m=np.array(self.d_m), alpha_rad=np.array(self.alpha_rad))

@@ -22,6 +22,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import (
     Array,
+    DeviceAnswers,
     DeviceIdentity,
     DeviceReport,
     Payload,
@@ -33,6 +34,7 @@ from drivers.interfaces import (
 )
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
+from drivers.ur.answers import answers_of
 from drivers.ur.dashboard import ControllerFacts, Dashboard
 from drivers.ur.link import VENDOR_ERRORS, probe, vendor
 from drivers.ur.primary import Calibration, calibration_of, not_asked
@@ -168,6 +170,10 @@ class UrRobot:
             },
             problems=tuple(problems),
         )
+
+    def answers(self) -> DeviceAnswers:
+        """Ask the dashboard, the primary interface and the stream; nothing is written."""
+        return answers_of(self._where, self._dashboard, self._samples.receive, kinematics_s=KINEMATICS_S)
 
     def _identity(self) -> DeviceIdentity:
         facts = opened(self._facts, self._where)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
@@ -16,7 +17,7 @@ from drivers.errors import (
     DeviceUnavailableError,
     UnreachablePoseError,
 )
-from drivers.interfaces import Array, Payload, RobotSample, Transform
+from drivers.interfaces import Array, Payload, RobotSample, Sample, Transform
 from drivers.ur import vendor as library
 from drivers.ur.safety import safety_state
 from drivers.ur.tool import ToolWatch
@@ -95,6 +96,29 @@ class SampleReader:
         """A sample that holds the pose of the tool's centre point, with that of the flange instead, and the tool."""
         T_base_flange = self.tool.flange(sample.joints_rad, sample.T_base_flange, payload)
         return replace(sample, T_base_flange=T_base_flange, T_flange_tcp=self.tool.T_flange_tcp, payload=payload)
+
+
+def stated_fields(receive: library.Receive) -> Sample:
+    """The fields of the newest sample as RTDE names them; without those that hold something that is no number."""
+    getters: dict[str, Callable[[], float | list[float]]] = {
+        "timestamp": receive.getTimestamp,
+        "actual_q": receive.getActualQ,
+        "actual_qd": receive.getActualQd,
+        "target_qd": receive.getTargetQd,
+        "actual_TCP_pose": receive.getActualTCPPose,
+        "actual_TCP_speed": receive.getActualTCPSpeed,
+        "safety_status_bits": receive.getSafetyStatusBits,
+        "robot_mode": receive.getRobotMode,
+        "runtime_state": receive.getRuntimeState,
+        "target_speed_fraction": receive.getTargetSpeedFraction,
+        "payload": receive.getPayload,
+        "payload_cog": receive.getPayloadCog,
+    }
+    said = {name: getters[name]() for name in VARIABLES}
+    fields = {name: tuple(value) if isinstance(value, list) else (value,) for name, value in said.items()}
+    return Sample(
+        source="RTDE", fields={name: value for name, value in fields.items() if all(map(math.isfinite, value))}
+    )
 
 
 def _take(receive: library.Receive, controller_time_s: float) -> tuple[RobotSample, Payload]:
