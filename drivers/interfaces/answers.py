@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 PropertyType = Literal["i8", "u8", "i16", "u16", "i32", "u32", "i64", "u64", "int", "str"]
 
 
+SERIES_DESCRIPTION = "SeriesDescription: "  # begins the line of a DICOM header that a person may have written
+
+
 class Part(BaseModel):
     """Base class of the parts of a recording."""
 

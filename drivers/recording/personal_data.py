@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from drivers.interfaces.answers import SERIES_DESCRIPTION
 from drivers.recording import Recording
 
 Secrets = Mapping[str, str]  # a text that must not appear: what it is, one of the names in TABLE
@@ -87,7 +88,7 @@ def _clean_answers(answers: Any, mask: _Mask) -> None:
         exchange["answer"] = mask.text(exchange["answer"])
     answers |= {"silent": [mask.text(text) for text in answers["silent"]]} if "silent" in answers else {}
     for header in answers.get("headers", ()):
-        header["lines"] = [mask.text(line) for line in header["lines"]]
+        header["lines"] = [mask.line(line) for line in header["lines"]]
     if listing := answers.get("listing"):
         kept = next((codes for maker, codes in _KEPT_TEXTS.items() if listing["maker"].startswith(maker)), set[str]())
         for one in listing["properties"]:
@@ -101,6 +102,9 @@ def _told(recording: Recording) -> Iterator[tuple[str, str]]:
         if device.report is not None:
             yield device.report.identity.serial, "serial number"
             yield device.report.identity.address, "address"
+        for line in (line for header in device.answers.headers for line in header.lines):
+            if line.startswith(SERIES_DESCRIPTION):
+                yield line.removeprefix(SERIES_DESCRIPTION), "description"
         for exchange in device.answers.exchanges:
             yield from _of_answer(exchange.question.lower(), exchange.answer)
 
@@ -132,6 +136,12 @@ class _Mask:
     def whole(self, text: str, what: str) -> str:
         """A placeholder for a whole text, if there is one."""
         return self._placeholder(text, what) if text else ""
+
+    def line(self, line: str) -> str:
+        """A line of a header."""
+        if line.startswith(SERIES_DESCRIPTION):
+            return SERIES_DESCRIPTION + self.whole(line.removeprefix(SERIES_DESCRIPTION), "description")
+        return self.text(line)
 
     def literals(self, text: str) -> str:
         """A text without what is known to be secret."""
