@@ -27,6 +27,7 @@ from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from tests.support.ct.ct_series import hospital, write_series
 
 # What is planted of each kind in the table; those known from the rig file, a folder or an answer are told beside.
+ROOT = Path(__file__).parents[2]
 PLANTED = {
     "serial number": ("20235001234", "LB-0001"),
     "program": ("meier knee.urp",),
@@ -92,6 +93,12 @@ def test_what_the_identity_tells_is_taken_out_of_all_else(place: str) -> None:
     identity = replace(report.identity, **{place: "KX 99/7-b"})
     device = told.devices["robot"].model_copy(update={"report": replace(report, identity=identity)})
     assert "KX 99" not in readable(without_personal_data(told.model_copy(update={"devices": {"robot": device}})))
+
+
+def test_the_how_to_says_what_is_taken_out() -> None:
+    words = (ROOT / "docs" / "howto" / "fault_report.md").read_text(encoding="utf-8")
+    listed = [line.removeprefix("- ").rstrip(";.") for line in words.splitlines() if line.startswith("- ")]
+    assert tuple(listed) == without_personal_data(recording("")).taken_out
 
 
 def test_what_helps_stays() -> None:
