@@ -72,7 +72,7 @@ def doctor_command(
         station = Station(rig_file)
         found = _reports(station, quiet=json)
         if record is not None:
-            record_devices(station, record, quiet=json)
+            record_devices(station, record, SystemClock(), quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
         free_bytes = shutil.disk_usage(existing).free
         place = _second_place(rig_file, data)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 from collections import Counter
-from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,9 +12,10 @@ from drivers.recording.personal_data import named, without_personal_data
 from service.cli.common import progress_bar
 from service.core.errors import ConfigurationError
 from service.station import Station
+from service.store.durable_effects import Clock
 
 
-def record_devices(station: Station, file: Path, *, quiet: bool) -> None:
+def record_devices(station: Station, file: Path, clock: Clock, *, quiet: bool) -> None:
     """Open each device once more, ask all that it tells, and write it without personal data.
 
     Raises ConfigurationError if the file exists or cannot be written.
@@ -32,7 +32,7 @@ def record_devices(station: Station, file: Path, *, quiet: bool) -> None:
             secrets |= told
     recording = Recording(
         by=f"orthocapture {version('orthocapture')}",
-        recorded_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        recorded_utc=clock.utc_now().isoformat(timespec="seconds"),
         devices=devices,
     )
     text = readable(without_personal_data(recording, secrets))
