@@ -41,6 +41,7 @@ PLACES = {
     "drivers/photo_watch.py": "a photograph of the step",
     "drivers/photos/photo_file.py": "a photograph of the step",
     "drivers/photos/photo_folder.py": _CHANGE,
+    "drivers/scan_folder.py": "the newest of several files, for a recording of devices",
     "drivers/video.py": "released_images has nothing to leave out: each image was asked for",
     "service/audit/background/child_process.py": _STAMP,
     "service/audit/bundle/contents.py": _STAMP,

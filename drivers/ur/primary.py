@@ -60,12 +60,6 @@ class ControllerKinematics:
         return f"this arm's own: the flange is {mm(away_m):.2f} mm from where the published dimensions put it"
 
 
-def not_asked(published: ArmModel | None, joints_rad: Array) -> str:
-    """What is known before the controller was asked."""
-    del published, joints_rad
-    return "not asked yet"
-
-
 def calibration_of(host: str, timeout_s: float) -> Calibration:
     """The controller's calibration in words, or why it is not known: nothing else depends on it."""
     try:

@@ -19,6 +19,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Array, Payload, RobotSample, Sample, Transform
 from drivers.ur import vendor as library
+from drivers.ur.agreement import Agreement
 from drivers.ur.safety import safety_state
 from drivers.ur.tool import ToolWatch
 from service.core.geometry import from_rotation_vector, to_rotation_vector
@@ -61,7 +62,8 @@ class NoNumberError(ValueError):
 class SampleReader:
     """Reads whole samples from the receive interface, and shows their safety state to the latch.
 
-    A sample with a value that is not a number raises NoNumberError.
+    A sample with a value that is not a number raises NoNumberError, one that contradicts those before
+    FrozenFieldError.
     """
 
     def __init__(self, latch: Latch) -> None:
@@ -69,11 +71,13 @@ class SampleReader:
         self._controller_time_s = -1.0  # of the last sample
         self.receive: library.Receive | None = None  # None while the arm is not connected
         self.tool = ToolWatch(latch)
+        self._agreement = Agreement()
 
     def read_from(self, receive: library.Receive) -> None:
         """Read from a new connection."""
         self.receive = receive
         self._controller_time_s = -1.0
+        self._agreement.start()
 
     def read(self) -> RobotSample | None:
         """The newest sample; None if none came since the last call, or if the arm is not connected."""
@@ -89,6 +93,15 @@ class SampleReader:
             if receive.getTimestamp() == before_s:
                 self._controller_time_s = before_s
                 self._latch.see(sample.safety, sample.monotonic_s)
+                self._agreement.see(
+                    sample.controller_time_s,
+                    sample.joints_rad,
+                    sample.joint_velocities_rad_s,
+                    sample.target_velocities_rad_s * speed_fraction(receive),
+                    sample.T_base_flange[:3, 3],
+                    sample.tcp_speed_m_s,
+                    sample.safety,
+                )
                 return self._of_flange(sample, payload)
         return None
 
