@@ -43,7 +43,7 @@ QUESTIONS = {
 
 #: Fields of which nobody can tell that they are frozen, since they may rest for hours in a sound arm.
 MAY_REST = {
-    "target_qd": "at zero: a hand may turn the joints, which the arm then reports so; frozen while it drives, it is seen",
+    "target_qd": "at zero, as of an arm that a hand turns; frozen while the arm is driven, it is seen",
     "safety_status_bits": "normal for a whole day; what stops an arm also ends the control script, which is seen",
     "robot_mode": "RUNNING for a whole day; an arm without power also ends the control script",
     "runtime_state": "PLAYING as long as the control script runs, which another connection tells",

@@ -14,7 +14,9 @@ import numpy as np
 from drivers.interfaces import Array, SafetyState
 
 WINDOW_S = 2.0  # over which motion and speeds are compared
-GAP_S = 0.1  # without samples, after which the comparison begins anew
+GAP_S = 0.025  # without samples, after which the comparison begins anew: nobody knows how it moved meanwhile
+LEAST_STEPS = 12  # with motion or speed in the window: of a shorter motion the samples tell too little
+_STILL = 1e-4  # rad or m in a step
 # Motion and integrated speed agree within these, and within a factor: speeds are filtered and lag behind.
 SLACK_RAD, SLACK_M, FACTOR = 0.05, 0.05, 3.0
 _JUMP_M = 0.03  # from one sample to the next: the tool was changed, not moved
@@ -28,8 +30,9 @@ class Agreement:
     """Compares over the last WINDOW_S how joints and tool moved with the speeds that the controller told."""
 
     def __init__(self) -> None:
-        # Controller time, joints (6,), integrals of their speeds and targets (6,), path of the tool, of its speed.
-        self._window: deque[tuple[float, Array, Array, Array, float, float]] = deque()
+        # Controller time, joints (6,), integrals of their speeds and targets (6,), path of the tool and integral of
+        # its speed, and in how many steps anything moved or told of a speed.
+        self._window: deque[tuple[float, Array, Array, Array, float, float, int]] = deque()
         self._last: tuple[Array, Array, Array, float] | None = None  # speeds, targets, position, speed of the tool
 
     def start(self) -> None:
@@ -53,16 +56,20 @@ class Agreement:
         moved_m = 0.0 if last is None else float(np.linalg.norm(position_m - last[2]))
         if newest is None or last is None or not 0.0 < at_s - newest[0] <= GAP_S or moved_m > _JUMP_M:
             self._window.clear()
-            self._window.append((at_s, joints_rad, np.zeros(6), np.zeros(6), 0.0, 0.0))
+            self._window.append((at_s, joints_rad, np.zeros(6), np.zeros(6), 0.0, 0.0, 0))
             return
         step_s = at_s - newest[0]
         told = newest[2] + step_s * (last[0] + speeds_rad_s) / 2
         wanted = newest[3] + step_s * (last[1] + targets_rad_s) / 2
         path_m, told_m = newest[4] + moved_m, newest[5] + step_s * (last[3] + tcp_speed_m_s) / 2
-        self._window.append((at_s, joints_rad, told, wanted, path_m, told_m))
+        changes = (joints_rad - newest[1], told - newest[2], wanted - newest[3], moved_m, told_m - newest[5])
+        steps = newest[6] + any(float(np.max(np.abs(one))) > _STILL for one in changes)
+        self._window.append((at_s, joints_rad, told, wanted, path_m, told_m, steps))
         while self._window[0][0] < at_s - WINDOW_S:
             self._window.popleft()
         began = self._window[0]
+        if steps - began[6] < LEAST_STEPS:
+            return
         turned_rad = np.abs(joints_rad - began[1])
         _compare("actual_qd", np.abs(told - began[2]), turned_rad, SLACK_RAD, "rad")
         if safety is SafetyState.NORMAL:  # in others the controller may move more slowly than it wants to
