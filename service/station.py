@@ -118,7 +118,7 @@ class Station:
         """All that a device says of itself, opened for this alone, and texts that must not leave with it.
 
         One that cannot be opened is given with the error and with what can be heard nevertheless. No arm is told its
-        payload. Raises ConfigurationError.
+        payload. Raises ConfigurationError if its section of the rig file is wrong.
         """
         spec, _ = self._spec(name)
         config = self._config(name, spec)

@@ -51,6 +51,16 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def not_recorded(args: argparse.Namespace) -> list[str]:
+    """What the body that is replayed did not tell when it was recorded, and what was taken out."""
+    if not args.replay:
+        return []
+    answers = recorded_device(args.replay, "gphoto", args.replayed).answers
+    texts = [one["code"] for one in answers["listing"]["properties"] if one["type"] == "str" and not one["value"]]
+    empty = [f"texts that are empty or were taken out: {', '.join(texts)}"] if texts else []
+    return [*empty, *(f"not recorded: {why}" for why in answers.get("silent", ()))]
+
+
 def recorded_devices(file: Path) -> tuple[RecordedDevice, ...]:
     """The devices of a recording. Raises SimulatorError if it cannot be read."""
     try:

@@ -130,8 +130,7 @@ class _Mask:
     def __init__(self, secrets: Secrets) -> None:
         self._names: dict[tuple[str, str], str] = {}
         self._counts: dict[str, int] = {}
-        longest = sorted(secrets, key=lambda text: (-len(text), text))
-        self._literals = [(re.compile(rf"(?<!\w){re.escape(text)}(?!\w)"), secrets[text]) for text in longest]
+        self._literals = sorted(secrets.items(), key=lambda one: (-len(one[0]), one[0]))  # the longest first
 
     def whole(self, text: str, what: str) -> str:
         """A placeholder for a whole text, if there is one."""
@@ -145,8 +144,9 @@ class _Mask:
 
     def literals(self, text: str) -> str:
         """A text without what is known to be secret."""
-        for pattern, what in self._literals:
-            text = pattern.sub(self._replacing(what), text)
+        for literal, what in self._literals:
+            if literal in text:  # a folder may hold as many names as a series has slices
+                text = re.sub(rf"(?<!\w){re.escape(literal)}(?!\w)", self._replacing(what), text)
         return text
 
     def text(self, text: str) -> str:

@@ -8,7 +8,7 @@ from simulators import still_camera
 from simulators.nikon_camera.body import NikonBody, names, recorded_table, replayed_table
 from simulators.nikon_camera.responder import NikonResponder
 from simulators.ptpip.server import PtpIpServer
-from simulators.recordings import add_replay
+from simulators.recordings import add_replay, not_recorded
 from simulators.serve import Termination
 
 
@@ -25,4 +25,4 @@ def serve(args: argparse.Namespace) -> None:
     table = replayed_table(args.replay, args.replayed) if args.replay else recorded_table(args.recorded)
     body = NikonBody(table, still_camera.image_source(args), args.faults, still_camera.body_options(args))
     server = PtpIpServer(args.host, args.port, body.table.model, NikonResponder(body, args.faults), args.faults)
-    still_camera.serve_until_stopped(server, body, termination)
+    still_camera.serve_until_stopped(server, body, termination, not_recorded(args))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from simulators import still_camera
-from simulators.recordings import add_replay
+from simulators.recordings import add_replay, not_recorded
 from simulators.serve import Termination
 from simulators.sony_camera.alpha_7r_v import alpha_7r_v
 from simulators.sony_camera.answers import with_answers
@@ -55,4 +55,5 @@ def serve(args: argparse.Namespace) -> None:
         body.fill_card()
     if args.old_file:
         body.shoot()
-    serve_until_stopped(SonyServer(args.host, args.port, body, args.faults), body, termination)
+    server = SonyServer(args.host, args.port, body, args.faults)
+    serve_until_stopped(server, body, termination, not_recorded(args))

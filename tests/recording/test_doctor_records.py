@@ -22,6 +22,7 @@ devices:
   second scanner: {driver: scan_folder, folder: nowhere, stable_s: 0}
   ct: {driver: dicom_folder, folder: ct, stable_s: 0}
   camera: {driver: gphoto, port: "ptpip:127.0.0.1:9:9"}
+  arm: {driver: ur, hots: Meier's arm}
 """
 
 
@@ -41,12 +42,14 @@ def test_folders_and_what_does_not_open_stand_in_the_file(tmp_path: Path) -> Non
     recording = recorded(tmp_path, FOLDERS)
     said = (tmp_path / "out.json").read_text(encoding="utf-8")
     assert not [word for word in ("Meier", "DOE", "4711", "127.0.0.1", str(tmp_path), tmp_path.name) if word in said]
-    assert list(recording.devices) == ["scanner", "scanner 2", "ct", "camera"]
-    scanner, missing, ct, camera = recording.devices.values()
+    assert list(recording.devices) == ["scanner", "scanner 2", "ct", "camera", "device"]
+    scanner, missing, ct, camera, wrong = recording.devices.values()
     assert missing.error == "there is no such folder. Mount the share, or correct the folder in rig.yaml"
     assert missing.report is None
     assert camera.error.startswith("Connecting failed")
     assert camera.answers.silent == ("the camera is not open. Open it first",)
+    assert wrong.driver == "ur"
+    assert "hots" in wrong.error
     assert {one.format for one in scanner.answers.headers} == {"PLY", "STL"}
     assert scanner.report is not None
     assert any("(file " in problem for problem in scanner.report.problems)

@@ -183,6 +183,15 @@ def test_a_dashboards_own_words_are_said_until_its_state_changes(tmp_path: Path)
         assert said(robot) == "Safetymode: PROTECTIVE_STOP"
 
 
+def test_what_a_replayed_body_does_not_tell_is_named(tmp_path: Path) -> None:
+    listed(tmp_path / "first.json", "camera", "--recorded", "ilce-1m2-3.00")
+    words = ("camera", "--port", "0", "--replay", str(tmp_path / "first.json"))
+    with simulator(*words) as running:
+        texts, numbers = running.ready["not_served"]
+    assert texts.startswith("texts that are empty or were taken out: d223")
+    assert numbers.startswith("not recorded: 56 properties in full")
+
+
 def test_what_no_simulator_serves_is_named(tmp_path: Path) -> None:
     with simulated_ur(address(61)) as ready:
         heard(tmp_path / "first.json", ready["host"])

@@ -26,7 +26,12 @@ def record_devices(station: Station, file: Path, clock: Clock, *, quiet: bool) -
     with progress_bar(quiet=quiet) as progress:
         for i, name in enumerate(station.names()):
             progress(f"recording {name}", i, len(station.names()))
-            said, told = station.heard(name)
+            try:
+                said, told = station.heard(name)
+            except ConfigurationError as error:  # its section is wrong, or its driver is not installed
+                section = station.rig.section.devices[name]
+                said = RecordedDevice(kind="device", driver=str(section.get("driver", "")), error=error.what)
+                told = named((str(value) for key, value in section.items() if key != "driver"), "address")
             counted[said.kind] += 1
             devices[said.kind if counted[said.kind] == 1 else f"{said.kind} {counted[said.kind]}"] = said
             secrets |= told
