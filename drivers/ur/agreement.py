@@ -19,7 +19,8 @@ LEAST_STEPS = 12  # with motion or speed in the window: of a shorter motion the 
 _STILL = 1e-4  # rad or m in a step
 # Motion and integrated speed agree within these, and within a factor: speeds are filtered and lag behind.
 SLACK_RAD, SLACK_M, FACTOR = 0.05, 0.05, 3.0
-_JUMP_M = 0.03  # from one sample to the next: the tool was changed, not moved
+# From one sample to the next, beyond what the joints explain for the longest arm: the tool was changed, not moved.
+_JUMP_M, _REACH_M = 0.03, 2.5
 
 
 class FrozenFieldError(ValueError):
@@ -54,7 +55,8 @@ class Agreement:
         last, self._last = self._last, (speeds_rad_s, targets_rad_s, position_m, tcp_speed_m_s)
         newest = self._window[-1] if self._window else None
         moved_m = 0.0 if last is None else float(np.linalg.norm(position_m - last[2]))
-        if newest is None or last is None or not 0.0 < at_s - newest[0] <= GAP_S or moved_m > _JUMP_M:
+        turned_m = 0.0 if newest is None else _REACH_M * float(np.sum(np.abs(joints_rad - newest[1])))
+        if newest is None or last is None or not 0.0 < at_s - newest[0] <= GAP_S or moved_m > _JUMP_M + turned_m:
             self._window.clear()
             self._window.append((at_s, joints_rad, np.zeros(6), np.zeros(6), 0.0, 0.0, 0))
             return

@@ -112,6 +112,6 @@ def test_a_frozen_field_is_named(
 def test_a_controller_whose_field_freezes_is_no_longer_believed(field: str) -> None:
     """Before, the motion came to its end as if all were well."""
     with faulty(71, {"on": f"field {field}", "kind": "freeze", "nth": 1}) as ready, opened(ready["host"]) as arm:
-        move(arm, turned(arm, 0.6))
+        move(arm, turned(arm, 2.0))
         with pytest.raises(DeviceUnavailableError, match=rf"{field} does not fit the motion.*may be frozen"):
             wait_for(lambda: not arm.is_moving())
