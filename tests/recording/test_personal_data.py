@@ -203,3 +203,15 @@ def test_the_header_of_a_scan_names_nobody(tmp_path: Path, name: str, content: b
     said = "|".join(texts(answers_of(scanner)))
     assert kept in said
     assert not [word for word in ("eier", "Hans") if word in said]
+
+
+@pytest.mark.parametrize("maker", ["Sony Corporation", "Nikon Corporation", "Canon Inc.", "Another"])
+def test_what_an_owner_wrote_into_a_body_is_no_part_of_its_listing(maker: str) -> None:
+    """Whatever it is: artist, copyright, comment and date have no form by which they could be found."""
+    codes = ("501e", "501f", "5011", "d090", "d115", "d1ce")
+    texts = [PtpProperty(code=code, type="str", access="rw", form="none", value="Jane Doe") for code in codes]
+    listing = Listing(maker=maker, model="a body", firmware="1", protocol=100, properties=tuple(texts))
+    device = RecordedDevice(kind="camera", driver="gphoto", answers=DeviceAnswers(listing=listing))
+    clean = without_personal_data(Recording(by="orthocapture", devices={"camera": device})).devices["camera"]
+    assert clean.answers.listing is not None
+    assert [one.value for one in clean.answers.listing.properties] == [""] * len(codes)
