@@ -40,7 +40,15 @@ from drivers.errors import (
     DeviceTimeoutError,
     DeviceUnavailableError,
 )
-from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, PedalReading, TowerLight
+from drivers.interfaces import (
+    DeviceAnswers,
+    DeviceIdentity,
+    DeviceReport,
+    EnvironmentReading,
+    Exchange,
+    PedalReading,
+    TowerLight,
+)
 from drivers.plugin import DriverConfig, DriverSpec
 from service.core.units import seconds_of_ms
 
@@ -117,6 +125,17 @@ class SerialLightbox:
             else:
                 details[request.lower()] = f"{number} {unit}".strip()
         return DeviceReport(identity=identity, details=details, problems=tuple(problems))
+
+    def answers(self) -> DeviceAnswers:
+        """Ask for everything that it measures and is; nothing is switched."""
+        exchanges: list[Exchange] = []
+        silent: list[str] = []
+        for question in ("*IDN?", "LIGHT?", "TEMP?", "SHUTTER?", "PEDAL?"):
+            try:
+                exchanges.append(Exchange(question=question, answer=self._ask(question, question[:-1])))
+            except (DeviceRefusedError, DeviceTimeoutError) as error:
+                silent.append(f"{question}: {error.what}")
+        return DeviceAnswers(exchanges=tuple(exchanges), silent=tuple(silent))
 
     def read(self) -> EnvironmentReading:
         """Return the light level in lux, the temperature in °C and the state of the shutter relay."""

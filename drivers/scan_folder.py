@@ -12,15 +12,17 @@ from pathlib import Path
 from pydantic import Field, field_validator
 
 from drivers.errors import DeviceUnavailableError, IncompleteExportError
-from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
+from drivers.interfaces import DeviceAnswers, DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
 from drivers.meshes.export_watch import ExportWatch, mesh_files
 from drivers.meshes.foreign_text import name_of
+from drivers.meshes.header_lines import header_lines
 from drivers.meshes.mesh_file import MESH_SUFFIXES, MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_profiles import profile_named
 from drivers.scan_profiles.profile import ScanProfile
 from drivers.scan_profiles.reading import check_export, read_export
 
+_MOST_HEADERS = 20  # in a recording of devices
 # What scanners' programs write, their own projects among it.
 _SURFACES = (*MESH_SUFFIXES, ".e57", ".asc", ".xyz", ".pcd", ".ptx", ".wrl", ".3mf", ".zdf", ".praw")
 
@@ -87,6 +89,16 @@ class ScanFolder:
             problems=pending,
         )
 
+    def answers(self) -> DeviceAnswers:
+        """The headers of the newest files that a scanner may have exported, complete or not."""
+        require_folder(self._config.folder)
+        files = sorted(mesh_files(self._config.folder, _SURFACES), key=_modified_ns)
+        said = [header_lines(path) for path in files[-_MOST_HEADERS:]]
+        return DeviceAnswers(
+            headers=tuple(one for one in said if not isinstance(one, str)),
+            silent=tuple(one for one in said if isinstance(one, str)),
+        )
+
     def exports(self) -> tuple[ScanExport, ...]:
         """Return the complete exports that this driver has seen unchanged for `stable_s`, oldest first."""
         require_folder(self._config.folder)
@@ -134,6 +146,13 @@ class ScanFolder:
             driver_version=f"orthocapture {version('orthocapture')}",
             address=str(self._config.folder),
         )
+
+
+def _modified_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:  # it has gone meanwhile
+        return 0
 
 
 def require_folder(folder: Path) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -23,14 +24,18 @@ from drivers.interfaces import (
     Camera,
     CtSource,
     Device,
+    DeviceAnswers,
     DeviceReport,
     Lightbox,
     Payload,
     RobotArm,
     Scanner,
     Transform,
+    answers_of,
 )
 from drivers.plugin import DriverConfig, DriverSpec
+from drivers.recording import RecordedDevice
+from drivers.recording.personal_data import Secrets, named
 from service.core.declared_kinds import plug_ins
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.records.import_list import ImportList
@@ -108,6 +113,37 @@ class Station:
         finally:
             device.close()
             self._unlock(name)
+
+    def heard(self, name: str) -> tuple[RecordedDevice, Secrets]:
+        """All that a device says of itself, opened for this alone, and texts that must not leave with it.
+
+        One that cannot be opened is given with the error and with what can be heard nevertheless. No arm is told its
+        payload. Raises ConfigurationError if its section of the rig file is wrong.
+        """
+        spec, _ = self._spec(name)
+        config = self._config(name, spec)
+        device = self._build(name)
+        report: DeviceReport | None = None
+        error, answers = "", DeviceAnswers()
+        try:
+            self._lock(name)
+            try:
+                device.open()
+                report = device.report()
+            except DeviceError as refusal:
+                error = _words_of(refusal)
+            try:
+                answers = answers_of(device)
+            except DeviceError as refusal:
+                answers = DeviceAnswers(silent=(_words_of(refusal),))
+        except DeviceError as refusal:
+            error = _words_of(refusal)
+        finally:
+            device.close()
+            self._unlock(name)
+        driver = str(self.rig.section.devices[name]["driver"])
+        said = RecordedDevice(kind=spec.kind, driver=driver, report=report, error=error, answers=answers)
+        return said, _secrets_of(config)
 
     def opened(self, kind: str) -> dict[str, Device]:
         """The open devices of a kind, by name."""
@@ -339,6 +375,24 @@ class Station:
             problems = [problem_of(details, tree, spec.config, at) for details in error.errors()]
             remedy = "Compare it with the example in docs/howto/your_hardware.md"
             refuse(problems, what="rig file", name=str(self.rig.path), remedy=remedy, error=ConfigurationError)
+
+
+def _secrets_of(config: DriverConfig) -> Secrets:
+    """What a device's section of the rig file tells of the site, and the names of files where it exports."""
+    settings = {field: str(value) for field, value in config.model_dump().items() if isinstance(value, str | Path)}
+    addresses = [value for field, value in settings.items() if field in (*_PATH_FIELDS, *_ADDRESS_FIELDS[:3])]
+    folder = Path(settings["folder"]) if settings.get("folder") else None
+    files = [] if folder is None or not folder.is_dir() else [path.name for path in folder.rglob("*")]
+    return {
+        **named(files, "file"),
+        **named(addresses, "address"),
+        **named([settings.get("serial", "")], "serial number"),
+    }
+
+
+def _words_of(error: DeviceError) -> str:
+    """What is wrong and what to do, without where: that names a place of this site."""
+    return f"{error.what}. {error.remedy}" if error.remedy else error.what
 
 
 def _one_name(field: str, address: str) -> str:

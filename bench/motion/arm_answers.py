@@ -41,6 +41,18 @@ QUESTIONS = {
 }
 
 
+#: Fields of which nobody can tell that they are frozen, since they may rest for hours in a sound arm.
+MAY_REST = {
+    "target_qd": "at zero, as of an arm that a hand turns; frozen while the arm is driven, it is seen",
+    "safety_status_bits": "normal for a whole day; what stops an arm also ends the control script, which is seen",
+    "robot_mode": "RUNNING for a whole day; an arm without power also ends the control script",
+    "runtime_state": "PLAYING as long as the control script runs, which another connection tells",
+    "target_speed_fraction": "the slider stays where it is; another speed only lasts longer",
+    "payload": "set once a run",
+    "payload_cog": "set once a run",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
     """One answer and what is wrong with it."""
@@ -158,6 +170,8 @@ def as_markdown(record: dict[str, Any]) -> str:
             f"| {row['answer']} | {row['wrong']} | {words} | {row['longest']}, {row['longest_s']:.1f} s | "
             f"{'yes' if row['works_again'] else '**no**: ' + row['calls'].get('again', '')} |"
         )
+    lines += ["", "What may rest in a sound arm, so that a frozen field is not told from a sound one:", ""]
+    lines += [f"- {field}: {why}." for field, why in record["may_rest"].items()]
     return "\n".join(lines) + "\n"
 
 
@@ -174,7 +188,7 @@ def main() -> None:
         for outcome in pool.map(tried, chosen, hosts):
             rows.append({**asdict(outcome), "words": outcome.words})
             print(json.dumps(rows[-1]), flush=True)
-    record = {"date": options.date, "commit": commit(), "machine": machine(), "rows": rows}
+    record = {"date": options.date, "commit": commit(), "machine": machine(), "rows": rows, "may_rest": MAY_REST}
     if options.only:
         print(as_markdown(record))
         return

@@ -14,6 +14,7 @@ import numpy as np
 from drivers.dicom_folder import DicomFolderConfig
 from drivers.dicom_folder.deidentify import deidentify
 from drivers.dicom_folder.files import dicom_files
+from drivers.dicom_folder.header_lines import header_lines
 from drivers.dicom_folder.headers import SEGMENTATION, SliceHeader, read_headers
 from drivers.dicom_folder.labels import placed
 from drivers.dicom_folder.nifti import check_nifti, is_nifti, read_nifti
@@ -26,6 +27,7 @@ from drivers.interfaces import (
     CtLabels,
     CtSeries,
     CtVolume,
+    DeviceAnswers,
     DeviceIdentity,
     DeviceReport,
     ScanExport,
@@ -35,6 +37,7 @@ from drivers.meshes.export_watch import ExportWatch
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.scan_folder import free_bytes, require_folder
 
+_MOST_HEADERS = 50  # in a recording of devices
 _ARRIVING = "still arriving"
 _Headers = tuple[SliceHeader, ...] | str  # of one file; or why it cannot be read
 
@@ -100,6 +103,15 @@ class DicomFolder:
                 "stable_s": f"{self._config.stable_s:g}",
             },
             problems=tuple(problems) + self._watch.poll()[1] + self._niftis.poll()[1],
+        )
+
+    def answers(self) -> DeviceAnswers:
+        """The header of one file of each series and each segmentation."""
+        firsts = [headers[0].path for headers in self._groups().values()][-_MOST_HEADERS:]
+        said = [header_lines(path) for path in firsts]
+        return DeviceAnswers(
+            headers=tuple(one for one in said if not isinstance(one, str)),
+            silent=tuple(one for one in said if isinstance(one, str)),
         )
 
     def series(self) -> tuple[CtSeries, ...]:

@@ -21,11 +21,19 @@ from drivers.errors import (
 )
 from drivers.gphoto.dials import NOT_TOLD, Dials
 from drivers.gphoto.link import AddedFile, Link, gp, library_version
+from drivers.gphoto.listing import listed
 from drivers.gphoto.profile import Profile, battery_fraction
 from drivers.gphoto.profiles import profile_for
 from drivers.gphoto.room import Room
 from drivers.gphoto.shutter import release_again, release_shutter
-from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
+from drivers.interfaces import (
+    CameraSettings,
+    CapturedFile,
+    CapturedImage,
+    DeviceAnswers,
+    DeviceIdentity,
+    DeviceReport,
+)
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
 from service.core.units import ms
@@ -173,6 +181,10 @@ class GphotoCamera:
             },
             problems=(*silent, *self._problems(battery, free)),
         )
+
+    def answers(self) -> DeviceAnswers:
+        """List all properties of the body, also of one that `open` refused."""
+        return listed(self._link)
 
     def _battery(self) -> float | None:
         try:

@@ -24,6 +24,7 @@ from drivers.errors import (
     DeviceUnavailableError,
 )
 from drivers.host.doing import doing as said
+from drivers.interfaces import PtpProperty
 
 gp: Any = importlib.import_module("gphoto2")  # no types; see docs/decisions/0002-strict-typing.md
 Gphoto = Any  # a gphoto2.Camera
@@ -34,6 +35,7 @@ LEAST_VERSION = (2, 5, 32)  # an older one gives the Alpha 7R V no list of ISO v
 OPEN_ATTEMPTS = 3
 PTPIP_MODEL = "PTP/IP Camera"
 _TO_CARD = "ptp2=capturetarget=card"  # as libgphoto2 writes it
+_NUMBER = re.compile(r"-?\d+")
 _REPORTED = re.compile(r'PTP Property [0-9a-f]{4} changed, "(?P<name>[^"]+)"')
 
 _ERRORS: dict[int, tuple[type[DeviceError], str]] = {
@@ -291,6 +293,41 @@ class Link:
             camera.set_single_config(name, widget)
 
         self.call(f"Setting {name} to {value}", write)
+
+    def summary(self) -> str:
+        """What libgphoto2 prints of the body with all its properties."""
+        return self.call("Listing all properties", lambda camera: str(camera.get_summary().text), optional=True)
+
+    def unlisted(self, code: str) -> PtpProperty:
+        """Read one property by its code, where the summary does not show it.
+
+        Raises DeviceRefusedError if it has no value.
+        """
+
+        def read(camera: Gphoto) -> PtpProperty:
+            widget = self._widget(camera, code)
+            kind, word = widget.get_type(), text_of(widget) or ""
+            access = "ro" if widget.get_readonly() else "rw"
+            if kind == gp.GP_WIDGET_RANGE:
+                low, high, step = (int(number) for number in widget.get_range())
+                numbers = (low, high - (high in (1 << 32, 1 << 64)), step)  # a float holds one more than a u32 or u64
+                return PtpProperty(
+                    code=code, type="int", access=access, form="range", numbers=numbers, value=int(float(word))
+                )
+            listed = kind in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU)
+            choices = [str(choice) for choice in widget.get_choices()] if listed else []
+            if all(map(_NUMBER.fullmatch, (word, *choices))):
+                return PtpProperty(
+                    code=code,
+                    type="int",
+                    access=access,
+                    form="enum" if listed else "none",
+                    numbers=tuple(map(int, choices)),
+                    value=int(word),
+                )
+            return PtpProperty(code=code, type="str", access=access, form="none", value=word)
+
+        return self.call(f"Reading the property {code}", read, optional=True)
 
     def free_bytes(self) -> int | None:
         """Free space of the camera's storage in bytes; None if the camera lists none (usual in PC Remote mode)."""

@@ -25,11 +25,13 @@ from drivers.grbl.homing import home
 from drivers.grbl.link import Link
 from drivers.grbl.mover import Mover
 from drivers.grbl.setup import Setup, setup_of
-from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Message, Status
+from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Message, Setting, Status
 from drivers.interfaces import (
     Array,
+    DeviceAnswers,
     DeviceIdentity,
     DeviceReport,
+    Exchange,
     Payload,
     RobotSample,
     RobotState,
@@ -124,6 +126,17 @@ class GrblTable:
             },
             problems=tuple(problems),
         )
+
+    def answers(self) -> DeviceAnswers:
+        """Ask for settings and build, as `open` does, and tell the last status."""
+        link, exchanges = self._linked(), list[Exchange]()
+        for question in ("$$", "$I"):
+            for one in link.request(question.encode(), self._config.answer_timeout_s):
+                answer = f"${one.number}={one.value:g}" if isinstance(one, Setting) else f"[{one.text}]"
+                exchanges.append(Exchange(question=question, answer=answer))
+        if (status := self._mover.status) is not None:
+            exchanges.append(Exchange(question="?", answer=status.state))
+        return DeviceAnswers(exchanges=tuple(exchanges))
 
     def _position_words(self) -> str:
         position = self._mover.position

@@ -29,7 +29,7 @@ from drivers.errors import (
 )
 from drivers.host.doing import MOST_ENDS, Note
 from drivers.host.heartbeat import CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S, Line
-from drivers.interfaces import DeviceIdentity
+from drivers.interfaces import Answering, DeviceIdentity
 from drivers.machine_pressure import HeldUp, killed_for_memory
 from drivers.plugin import READING_TIMEOUT_S
 from service.core.errors import OrthocaptureError
@@ -62,7 +62,7 @@ def hosted(
     reading_timeout_s: float = READING_TIMEOUT_S,
     on_end: OnEnd = lambda _how, _error: None,
 ) -> T:
-    """Return a proxy with exactly the public methods of `interface`; each call runs in the driver's own process.
+    """Return a proxy with the public methods of `interface` and `answers`; each call runs in the driver's process.
 
     Args:
         interface: RobotArm, Camera, … (a Protocol derived from Device).
@@ -85,7 +85,7 @@ def hosted(
         on_end=on_end,
     )
     methods: dict[str, Any] = {"__init__": _keep_device, "__doc__": f"{interface.__name__} in a process of its own."}
-    for base in reversed(interface.__mro__):
+    for base in (Answering, *reversed(interface.__mro__)):
         for method, function in vars(base).items():
             if not method.startswith("_") and callable(function):
                 methods[method] = _forwarder(method, function)

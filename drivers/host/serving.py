@@ -19,7 +19,7 @@ from typing import Any, cast
 from drivers.errors import DeviceFaultError
 from drivers.host.doing import leave_out, take_note
 from drivers.host.heartbeat import BEAT, CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S
-from drivers.interfaces import Device
+from drivers.interfaces import Answering, Device, answers_of
 from drivers.plugin import DriverSpec, NeedsHeartbeat
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.loading import loading
@@ -92,6 +92,8 @@ class _Server:
                 spec = load_spec(spec_path)
                 self._device = spec.build(spec.config.model_validate_json(config_json))
             return isinstance(self._device, NeedsHeartbeat)
+        if method == Answering.answers.__name__:
+            return answers_of(self._device)
         return getattr(self._device, method)(*args, **kwargs)
 
 

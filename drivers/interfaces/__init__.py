@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
+from drivers.interfaces.answers import (
+    Answering,
+    DeviceAnswers,
+    Exchange,
+    FileHeader,
+    Listing,
+    PtpProperty,
+    Sample,
+    answers_of,
+)
 from drivers.interfaces.camera import Camera, CameraSettings, CapturedFile, CapturedImage
 from drivers.interfaces.device import Array, Device, DeviceIdentity, DeviceReport, Transform
 from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, PedalReading, TowerLight
@@ -29,6 +39,7 @@ from drivers.interfaces.surfaces import (
 
 __all__ = [
     "Abandoned",
+    "Answering",
     "Array",
     "Camera",
     "CameraSettings",
@@ -40,17 +51,23 @@ __all__ = [
     "CtSource",
     "CtVolume",
     "Device",
+    "DeviceAnswers",
     "DeviceIdentity",
     "DeviceReport",
     "EnvironmentReading",
+    "Exchange",
+    "FileHeader",
     "Lightbox",
+    "Listing",
     "Mesh",
     "Payload",
     "PedalReading",
+    "PtpProperty",
     "RobotArm",
     "RobotSample",
     "RobotState",
     "SafetyState",
+    "Sample",
     "ScanExport",
     "ScannedMesh",
     "Scanner",
@@ -58,4 +75,5 @@ __all__ = [
     "SettleReport",
     "TowerLight",
     "Transform",
+    "answers_of",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import time
 from collections import deque
 from typing import NoReturn
@@ -23,11 +24,14 @@ from drivers.errors import (
 )
 from drivers.interfaces import (
     Array,
+    DeviceAnswers,
     DeviceIdentity,
     DeviceReport,
+    Exchange,
     Payload,
     RobotSample,
     RobotState,
+    Sample,
     SettleCriteria,
     SettleReport,
     Transform,
@@ -186,6 +190,26 @@ class KukaRobot:
             f"The controller has the flange {mm(apart_m):.1f} mm from where its joints put it. Set "
             "the robot's base to the origin of the world in the station setup, and install it again"
         ]
+
+    def answers(self) -> DeviceAnswers:
+        """What the application greeted with, and the newest line of its stream."""
+        link, state = self._linked(), self._newest()
+        greeting = json.dumps(dataclasses.asdict(link.hello))
+        now = f"mode {state.mode}, safety {state.safety.value}, ready {state.ready}, locked {state.locked}"
+        return DeviceAnswers(
+            exchanges=(Exchange(question="greeting", answer=greeting), Exchange(question="state", answer=now)),
+            samples=(
+                Sample(
+                    source="stream",
+                    fields={
+                        "time_s": (state.time_s,),
+                        "joints_rad": tuple(map(float, state.joints_rad)),
+                        "commanded_rad": tuple(map(float, state.commanded_rad)),
+                        "override": (state.override,),
+                    },
+                ),
+            ),
+        )
 
     def _identity(self) -> DeviceIdentity:
         hello = self._linked().hello

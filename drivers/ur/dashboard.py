@@ -13,8 +13,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.errors import DeviceFaultError, DeviceRefusedError, DeviceUnavailableError
+from drivers.interfaces import Exchange
 
 PORT = 29999
+#: What a dashboard can be asked without any effect.
+QUESTIONS = (
+    "PolyscopeVersion",
+    "version",
+    "get robot model",
+    "get serial number",
+    "robotmode",
+    "safetymode",
+    "safetystatus",
+    "is in remote control",
+    "get operational mode",
+    "running",
+    "programState",
+    "get loaded program",
+)
 MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # the first with get_inverse_kin_has_solution()
 _SWITCH = "Switch the pendant from Local to Remote, then try again"
 _LONGEST_SERIAL = 20
@@ -22,6 +38,7 @@ _LONGEST_MODEL = 30  # such as UR8 Long
 _LONGEST_LINE = 1000  # limit for answers, which are less than a tenth as long
 _REMEDY = "Check that this address is that of a Universal Robots controller, then restart it"
 _E_SERIES = ("UR3", "UR5", "UR10", "UR16")  # whose letter the dashboard leaves out; larger arms have none
+_PATIENCE = 2  # questions without an answer after which no more are asked
 _SHOWN = 120  # characters of an unexpected answer in messages
 
 
@@ -67,6 +84,19 @@ class Dashboard:
             raise self._nonsense(f"the controller reports no model of a robot: {model[:_SHOWN]!r}")
         letter = "e" if version[0] >= 5 and model in _E_SERIES else ""
         return ControllerFacts(f"{model}{letter}", serial, match.group(0), version)
+
+    def said(self) -> tuple[tuple[Exchange, ...], tuple[str, ...]]:
+        """The answers to all questions that change nothing, and why some got none; a dead server is not asked on."""
+        exchanges: list[Exchange] = []
+        silent: list[str] = []
+        for question in QUESTIONS:
+            try:
+                exchanges.append(Exchange(question=question, answer=self._ask(question)[0]))
+            except DeviceUnavailableError as error:
+                silent.append(error.what)
+                if len(silent) == _PATIENCE:
+                    break
+        return tuple(exchanges), tuple(silent)
 
     def obstacle(self, version: tuple[int, int], *, running: bool) -> DeviceRefusedError | None:
         """Why the controller starts no program for a client: it is in local control. None if it is not.

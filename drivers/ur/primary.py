@@ -40,6 +40,10 @@ class ControllerKinematics:
     d_m: tuple[float, ...]
     alpha_rad: tuple[float, ...]
 
+    def fields(self) -> dict[str, tuple[float, ...]]:
+        """The parameters by name."""
+        return {"theta_rad": self.theta_rad, "a_m": self.a_m, "d_m": self.d_m, "alpha_rad": self.alpha_rad}
+
     def departure_m(self, published: ArmModel, joints_rad: Array) -> float:
         """How far it has the flange from where the published dimensions put it."""
         own = replace(published, a_m=np.array(self.a_m), d_m=np.array(self.d_m), alpha_rad=np.array(self.alpha_rad))
@@ -54,12 +58,6 @@ class ControllerKinematics:
         if away_m < _SAME_M:
             return "the published dimensions: the controller has no calibration of this arm"
         return f"this arm's own: the flange is {mm(away_m):.2f} mm from where the published dimensions put it"
-
-
-def not_asked(published: ArmModel | None, joints_rad: Array) -> str:
-    """What is known before the controller was asked."""
-    del published, joints_rad
-    return "not asked yet"
 
 
 def calibration_of(host: str, timeout_s: float) -> Calibration:

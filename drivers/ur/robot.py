@@ -22,6 +22,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import (
     Array,
+    DeviceAnswers,
     DeviceIdentity,
     DeviceReport,
     Payload,
@@ -33,9 +34,10 @@ from drivers.interfaces import (
 )
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
+from drivers.ur.answers import answers_of
 from drivers.ur.dashboard import ControllerFacts, Dashboard
 from drivers.ur.link import VENDOR_ERRORS, probe, vendor
-from drivers.ur.primary import Calibration, calibration_of, not_asked
+from drivers.ur.primary import Calibration, calibration_of
 from drivers.ur.safety import safety_error
 from drivers.ur.samples import (
     PLAYING,
@@ -83,7 +85,7 @@ class UrRobot:
             newest=self._newest,
         )
         self._script = ControlScript(config, self._latch, self._watchdog, end_others=self._end_others)
-        self._calibration: Calibration = not_asked
+        self._calibration: Calibration | None = None  # asked for by the first report of a connection
         self._configured: tuple[Payload, Transform] | None = None  # the tool as this driver set it
         self._tool_read = 0  # value of ControlScript.sent when the tool was last read
 
@@ -98,7 +100,7 @@ class UrRobot:
         self.close()
         probe(self._config.host, self._config.connect_timeout_s)
         self._facts = facts = self._dashboard.facts()
-        self._calibration = calibration_of(self._config.host, KINEMATICS_S)
+        self._calibration = None
         self._configured = None
         self._samples.tool.start(known_arm(facts.model))
         with vendor(self._where, "connecting the receive interface"):
@@ -153,6 +155,8 @@ class UrRobot:
                 f"The speed slider stands at {100 * state.speed_fraction:.0f} %: motions take longer. "
                 "Set it to 100 % on the pendant"
             )
+        if self._calibration is None:
+            self._calibration = calibration_of(self._config.host, KINEMATICS_S)
         tcp, identity = to_rotation_vector(self._samples.tool.T_flange_tcp), self._identity()
         return DeviceReport(
             identity=identity,
@@ -168,6 +172,10 @@ class UrRobot:
             },
             problems=tuple(problems),
         )
+
+    def answers(self) -> DeviceAnswers:
+        """Ask the dashboard, the primary interface and the stream; nothing is written."""
+        return answers_of(self._where, self._dashboard, self._samples.receive, kinematics_s=KINEMATICS_S)
 
     def _identity(self) -> DeviceIdentity:
         facts = opened(self._facts, self._where)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
@@ -16,8 +17,9 @@ from drivers.errors import (
     DeviceUnavailableError,
     UnreachablePoseError,
 )
-from drivers.interfaces import Array, Payload, RobotSample, Transform
+from drivers.interfaces import Array, Payload, RobotSample, Sample, Transform
 from drivers.ur import vendor as library
+from drivers.ur.agreement import Agreement
 from drivers.ur.safety import safety_state
 from drivers.ur.tool import ToolWatch
 from service.core.geometry import from_rotation_vector, to_rotation_vector
@@ -60,7 +62,8 @@ class NoNumberError(ValueError):
 class SampleReader:
     """Reads whole samples from the receive interface, and shows their safety state to the latch.
 
-    A sample with a value that is not a number raises NoNumberError.
+    A sample with a value that is not a number raises NoNumberError, one that contradicts those before
+    FrozenFieldError.
     """
 
     def __init__(self, latch: Latch) -> None:
@@ -68,11 +71,13 @@ class SampleReader:
         self._controller_time_s = -1.0  # of the last sample
         self.receive: library.Receive | None = None  # None while the arm is not connected
         self.tool = ToolWatch(latch)
+        self._agreement = Agreement()
 
     def read_from(self, receive: library.Receive) -> None:
         """Read from a new connection."""
         self.receive = receive
         self._controller_time_s = -1.0
+        self._agreement.start()
 
     def read(self) -> RobotSample | None:
         """The newest sample; None if none came since the last call, or if the arm is not connected."""
@@ -88,6 +93,15 @@ class SampleReader:
             if receive.getTimestamp() == before_s:
                 self._controller_time_s = before_s
                 self._latch.see(sample.safety, sample.monotonic_s)
+                self._agreement.see(
+                    sample.controller_time_s,
+                    sample.joints_rad,
+                    sample.joint_velocities_rad_s,
+                    sample.target_velocities_rad_s * speed_fraction(receive),
+                    sample.T_base_flange[:3, 3],
+                    sample.tcp_speed_m_s,
+                    sample.safety,
+                )
                 return self._of_flange(sample, payload)
         return None
 
@@ -95,6 +109,29 @@ class SampleReader:
         """A sample that holds the pose of the tool's centre point, with that of the flange instead, and the tool."""
         T_base_flange = self.tool.flange(sample.joints_rad, sample.T_base_flange, payload)
         return replace(sample, T_base_flange=T_base_flange, T_flange_tcp=self.tool.T_flange_tcp, payload=payload)
+
+
+def stated_fields(receive: library.Receive) -> Sample:
+    """The fields of the newest sample as RTDE names them; without those that hold something that is no number."""
+    getters: dict[str, Callable[[], float | list[float]]] = {
+        "timestamp": receive.getTimestamp,
+        "actual_q": receive.getActualQ,
+        "actual_qd": receive.getActualQd,
+        "target_qd": receive.getTargetQd,
+        "actual_TCP_pose": receive.getActualTCPPose,
+        "actual_TCP_speed": receive.getActualTCPSpeed,
+        "safety_status_bits": receive.getSafetyStatusBits,
+        "robot_mode": receive.getRobotMode,
+        "runtime_state": receive.getRuntimeState,
+        "target_speed_fraction": receive.getTargetSpeedFraction,
+        "payload": receive.getPayload,
+        "payload_cog": receive.getPayloadCog,
+    }
+    said = {name: getters[name]() for name in VARIABLES}
+    fields = {name: tuple(value) if isinstance(value, list) else (value,) for name, value in said.items()}
+    return Sample(
+        source="RTDE", fields={name: value for name, value in fields.items() if all(map(math.isfinite, value))}
+    )
 
 
 def _take(receive: library.Receive, controller_time_s: float) -> tuple[RobotSample, Payload]:

@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 
 from simulators.faults import FaultPlan
-from simulators.sony_camera.properties import CameraProperty
+from simulators.sony_camera.properties import BodyTable, CameraProperty
 from simulators.sony_camera.recorded import table_of
 from simulators.still_camera.body import BodyOptions, CameraBody, CameraFile, FileNames
 from simulators.still_camera.card import FOLDER_PICTURES
@@ -20,20 +20,31 @@ FORMAT_NEF = 0x3000
 COMPRESSION, F_NUMBER, ISO, EXPOSURE_TIME = 0x5004, 0x5007, 0x500F, 0xD100
 _RAW, _BOTH = (4,), (5, 6, 7)  # compressions
 _FOLDER = Path(str(resources.files("simulators.nikon_camera"))) / "recordings"
+_MAKER = "Nikon"
 _UNSTATED = {COMPRESSION: 2, F_NUMBER: 800, ISO: 100, EXPOSURE_TIME: 1 << 16 | 60}
 
 
 @cache
 def names() -> tuple[str, ...]:
     """The recorded bodies."""
-    return tuple(sorted(file.stem for file in _FOLDER.glob("*.txt")))
+    return tuple(sorted(file.stem for file in _FOLDER.glob("*.json")))
+
+
+def recorded_table(name: str) -> BodyTable:
+    """The table of a recorded body. Raises SimulatorError if there is none of this name."""
+    return replayed_table(_FOLDER / f"{name}.json")
+
+
+def replayed_table(file: Path, name: str = "") -> BodyTable:
+    """The table of the body of this name in a recording, or of its first. Raises SimulatorError."""
+    return table_of(file, _MAKER, name)
 
 
 class NikonBody(CameraBody):
     """A body that was recorded, whose files stay on its card."""
 
-    def __init__(self, recorded: str, source: ImageSource, faults: FaultPlan, options: BodyOptions) -> None:
-        self.table = table_of(_FOLDER / f"{recorded}.txt")
+    def __init__(self, table: BodyTable, source: ImageSource, faults: FaultPlan, options: BodyOptions) -> None:
+        self.table = table
         plate = Nameplate("NIKON CORPORATION", f"NIKON {self.table.model}", "", "6012345", self.table.firmware, 2)
         super().__init__(source, faults, options, plate, FileNames("DSC_{:04d}", ".NEF", FORMAT_NEF))
         self._properties = {entry.code: entry for entry in self.table.properties}

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from simulators.rig.deliveries import (
 )
 from simulators.rig.export_processes import ExportProcesses
 from simulators.rig.patience import patient
+from simulators.rig.replay import NOTHING, Replay, replay_of
 from simulators.rig.truth import truth_of
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.arm import ARM_ERRORS, ARM_ERRORS_USUAL
@@ -93,6 +94,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ahead", action="store_true", help="compute what the CT and the scanner deliver before it is asked for"
     )
+    parser.add_argument(
+        "--replay",
+        type=Path,
+        metavar="FILE",
+        help="arms and camera serve what `orthocapture doctor --record FILE` wrote; the ready line names the rest",
+    )
     add_patience(parser)
 
 
@@ -107,8 +114,13 @@ def serve(args: argparse.Namespace) -> None:
     if args.camera not in STILL and (args.hand or len(args.second_camera_model) < len(args.second_camera)):
         raise SimulatorError(f"--camera {args.camera} can neither be held nor be a second camera: choose a still one")
     check_delivery_arguments(args)
+    replay = NOTHING if args.replay is None else replay_of(args.replay.resolve())
+    if replay.arms:
+        args.arm, args.arms = replay.arm, replay.arms
+    if replay.camera:
+        args.camera = STILL[0]
     termination = Termination()
-    rig = _Rig(args, termination)
+    rig = _Rig(args, termination, replay)
     try:
         rig.start()
         termination.wait()
@@ -117,8 +129,9 @@ def serve(args: argparse.Namespace) -> None:
 
 
 class _Rig:
-    def __init__(self, args: argparse.Namespace, termination: Termination) -> None:
+    def __init__(self, args: argparse.Namespace, termination: Termination, replay: Replay) -> None:
         self.args = args
+        self.replay = replay
         self.termination = termination
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
@@ -171,7 +184,8 @@ class _Rig:
                 "--patience", str(self.args.patience), *self._model(),
             )  # fmt: skip
         camera = self._child(
-            "camera", CAMERAS[self.args.camera], *place(self.args.camera, self.args.host, self.folder),
+            "camera", self.replay.camera or CAMERAS[self.args.camera],
+            *place(self.args.camera, self.args.host, self.folder),
             "--world", world, "--image-width", str(self.args.image_width),
             "--exposures-log", str(self._exposures_log("camera")),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
@@ -189,9 +203,15 @@ class _Rig:
             truth=str(self.folder / "truth.json"),
             ct_folder=str(self.folder / "ct"),
             scan_folder=str(self.folder / "scans"),
+            not_served=[*self.replay.not_served, *self._left_out()],
         )
         threading.Thread(target=self._watch, daemon=True).start()
         self._exports.prepare_after("start")
+
+    def _left_out(self) -> Iterator[str]:
+        """What the simulators that serve a recording answer by themselves."""
+        for name, ready in self._ready.items():
+            yield from (f"{name}, {what}" for what in ready.get("not_served", ()))
 
     def _start_further(self, name: str, further: FurtherCamera, model: str) -> None:
         """Start a further camera's simulator, and write its calibration, which is exact."""
@@ -250,7 +270,8 @@ class _Rig:
     def _child(self, name: str, *words: str) -> dict[str, Any]:
         """Start a simulator and wait for its ready line."""
         command = [
-            sys.executable, "-m", "simulators", *words, "--parent", str(os.getpid()),
+            sys.executable, "-m", "simulators", *words, *self.replay.words.get(name, ()),
+            "--parent", str(os.getpid()),
             "--faults", (self.faults.of(name, "camera") if name in self.further else self.faults).to_json(),
         ]  # fmt: skip
         with (self.folder / "logs" / f"{name}.log").open("w") as log:

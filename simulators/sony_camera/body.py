@@ -100,6 +100,10 @@ class SonyBody(CameraBody):
         """Say how many photographs the card still holds."""
         self.properties.put(Code.SLOT_1_SHOTS, self.free_bytes // _PICTURE_BYTES)
 
+    def fill_card(self) -> None:
+        """Leave so much room on the card as the table says."""
+        self.free_bytes = self.properties.value(Code.SLOT_1_SHOTS) * _PICTURE_BYTES
+
     def exposure_settings(self) -> ExposureSettings:
         """The settings with which the next exposure will be taken."""
         return self.properties.exposure_settings()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 from simulators.ptpip.server import PtpIpServer
@@ -80,14 +81,22 @@ def body_options(args: argparse.Namespace) -> BodyOptions:
     )
 
 
-def serve_until_stopped(server: PtpIpServer, body: CameraBody, termination: Termination) -> None:
-    """Print the ready line and serve until SIGTERM."""
+def serve_until_stopped(
+    server: PtpIpServer, body: CameraBody, termination: Termination, not_served: Sequence[str] = ()
+) -> None:
+    """Print the ready line, with what is not served of a recording, and serve until SIGTERM."""
     pictures, stop = body.source, threading.Event()
     if isinstance(pictures, WorldSource):
         threading.Thread(target=pictures.warm_up, args=(stop,), name="warm-up", daemon=True).start()
         threading.Thread(target=_attend_button, args=(pictures, body, stop), name="button", daemon=True).start()
     with server:
         host, port = server.address
-        announce(simulator="camera", host=host, port=port, gphoto_port=f"ptpip:{host}:{port}:{port}")
+        announce(
+            simulator="camera",
+            host=host,
+            port=port,
+            gphoto_port=f"ptpip:{host}:{port}:{port}",
+            not_served=list(not_served),
+        )
         termination.wait()
     stop.set()

@@ -9,9 +9,11 @@ from types import FrameType
 
 import numpy as np
 
+from simulators.recordings import add_replay, recorded_device
 from simulators.serve import SimulatorError, Termination, add_patience, announce
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
+from simulators.ur_controller.replay import recorded
 from simulators.ur_controller.server import CUT_OFF_S, DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
 from simulators.world_link import WorldLink
 
@@ -40,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fieldbus", action="store_true", help="a fieldbus is on, which reserves the input registers 0 to 23"
     )
+    add_replay(parser)
     add_patience(parser)
 
 
@@ -49,18 +52,22 @@ def serve(args: argparse.Namespace) -> None:
     Raises SimulatorError.
     """
     termination = Termination()
-    model = MODELS[args.model]
+    replayed = recorded(recorded_device(args.replay, "ur", args.replayed)) if args.replay else None
+    model = replayed.model if replayed else MODELS[args.model]
+    version = replayed.version if replayed else _version(args.version)
+    as_recorded = None if replayed is None or args.initial_joints else replayed.joints
     controller = Controller(
         model,
-        _version(args.version),
-        joints=_joints(args.initial_joints),
+        version,
+        joints=_joints(args.initial_joints) if as_recorded is None else as_recorded,
         serial=args.serial or f"2023{'5' if model.e_series else '3'}{_last_number(args.host):05d}",
         faults=args.faults,
         device=args.arm,
         speed_up=args.speed_up,
         patience_s=args.patience,
     )
-    controller.local = args.local
+    words = replayed.set_up(controller) if replayed else None
+    controller.local |= args.local
 
     def turn_key(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -71,17 +78,26 @@ def serve(args: argparse.Namespace) -> None:
     if args.world:
         host, _, port = args.world.rpartition(":")
         world = WorldLink((host, int(port)), args.arm)
-    server = Server(controller, args.host, world, args.pendant_port, cut_off_s=args.cut_off, fieldbus=args.fieldbus)
+    server = Server(
+        controller,
+        args.host,
+        world,
+        args.pendant_port,
+        cut_off_s=args.cut_off,
+        fieldbus=args.fieldbus,
+        words=words,
+    )
     announce(
         host=args.host,
         rtde=f"{args.host}:{RTDE_PORT}",
         dashboard=f"{args.host}:{DASHBOARD_PORT}",
         script=f"{args.host}:{SCRIPT_PORT}",
         pendant=f"{args.host}:{args.pendant_port}",
-        model=args.model,
-        version=args.version,
+        model=model.name,
+        version=".".join(map(str, version)),
         serial=controller.serial,
         pid=os.getpid(),
+        not_served=list(replayed.not_served) if replayed else [],
     )
     try:
         server.run(termination)

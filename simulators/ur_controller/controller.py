@@ -93,6 +93,7 @@ class Controller:
         self._ring: tuple[float, Array] | None = None
         self._hand: Hand | None = None  # somebody pushes the arm
         self._pushed = np.zeros(6)  # from the path of the motion under way
+        self._pushed_qd = np.zeros(6)  # how fast the hand turns the joints
         self._place_tool()
 
     # --- cycle -------------------------------------------------------------------------------------------
@@ -141,7 +142,7 @@ class Controller:
             return
         self.target_q = self.motion.q + self._pushed
         self.target_qd, self.target_qdd = self.motion.qd * scale, self.motion.qdd * scale
-        self.actual_q, self.actual_qd = self.target_q, self.target_qd
+        self.actual_q, self.actual_qd = self.target_q, self.target_qd + self._pushed_qd
         if self.motion.done:
             self.motion = None
         self._place_tool()
@@ -153,8 +154,9 @@ class Controller:
         if hand.done and self.robot_mode is RobotMode.BACKDRIVE:
             self._enter(RobotMode.IDLE)
         self._pushed, self.target_q = self._pushed + step, self.target_q + step
+        self._pushed_qd = np.zeros(6) if hand.done else step / max(dt_s, 1e-6)
         if self.motion is None and self._ring is None:
-            self.actual_q, self.actual_qd = self.target_q, np.zeros(6) if hand.done else step / max(dt_s, 1e-6)
+            self.actual_q, self.actual_qd = self.target_q, self._pushed_qd
             self._place_tool()
 
     def _swing(self) -> None:

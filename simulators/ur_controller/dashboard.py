@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.modes import Runtime, SafetyMode
 from simulators.ur_controller.program import Interpreter
 
+Words = Mapping[tuple[str, str], str]  # a question in small letters, and our answer: a recorded controller's answer
 WELCOME = "Connected: Universal Robots Dashboard Server"
 _BUILD = {3: "106331 (Jul 07 2021)", 5: "1101319 (Mar 22 2022)"}
 _FIXED = {
@@ -30,15 +31,19 @@ class Dashboard:
     until it connects again (Universal_Robots_ROS_Driver#262).
     """
 
-    def __init__(self, controller: Controller, interpreter: Interpreter) -> None:
+    def __init__(self, controller: Controller, interpreter: Interpreter, words: Words | None = None) -> None:
         self._controller = controller
+        self._words: Words = words or {}
         self._interpreter = interpreter
         self._met_local = controller.local
 
     def answer(self, line: str) -> str:
-        """Return the reply to one line, without its line end."""
+        """Return the reply to one line, without its line end: in recorded words, where there are some for it."""
         command = " ".join(line.strip().split())
-        word = command.lower()
+        own = self._own(command, command.lower())
+        return self._words.get((command.lower(), own), own)
+
+    def _own(self, command: str, word: str) -> str:
         if word in _FIXED:
             return _FIXED[word]
         queries = self._queries()

@@ -12,19 +12,23 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 JOINT_LIMIT_RAD = 2 * math.pi
-_COS_ALPHA = (0.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # alpha = 90°, 0, 0, 90°, -90°, 0 for every model
-_SIN_ALPHA = (1.0, 0.0, 0.0, 1.0, -1.0, 0.0)
+Six = tuple[float, float, float, float, float, float]
+_ALPHA_RAD: Six = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)  # of every model, as published
+_COS_ALPHA, _SIN_ALPHA = (0.0, 1.0, 1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0, -1.0, 0.0)  # exactly
+_NONE: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A robot model: its nominal DH parameters (metres, as published by the manufacturer) and its ratings."""
+    """A robot model: its DH parameters, those published by the maker or one calibrated arm's, and its ratings."""
 
     name: str
-    a_m: tuple[float, float, float, float, float, float]
-    d_m: tuple[float, float, float, float, float, float]
+    a_m: Six
+    d_m: Six
     payload_kg: float
     e_series: bool = True
+    theta_rad: Six = _NONE
+    alpha_rad: Six = _ALPHA_RAD
 
 
 def _model(
@@ -59,8 +63,10 @@ def frames(model: Model, q: Array) -> list[Array]:
 
 def _link(model: Model, i: int, angle: float) -> Array:
     """T_i_(i+1) of the DH table, (4, 4)."""
-    c, s = math.cos(angle), math.sin(angle)
-    ca, sa, a = _COS_ALPHA[i], _SIN_ALPHA[i], model.a_m[i]
+    turned = angle + model.theta_rad[i]
+    c, s, a = math.cos(turned), math.sin(turned), model.a_m[i]
+    alpha = model.alpha_rad[i]
+    ca, sa = (_COS_ALPHA[i], _SIN_ALPHA[i]) if alpha == _ALPHA_RAD[i] else (math.cos(alpha), math.sin(alpha))
     return np.array(
         [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0.0, sa, ca, model.d_m[i]], [0.0, 0.0, 0.0, 1.0]]
     )
@@ -89,7 +95,8 @@ def inverse(model: Model, T_base_flange: Array, near: Array) -> Array | None:
     """Return the joints (6,) that reach the pose, closest to `near` and within ±360°; None if it is unreachable."""
     best: Array | None = None
     best_distance = math.inf
-    for candidate in _postures(model, T_base_flange, near):
+    published = MODELS.get(model.name, model)  # of which the postures have a formula; a calibrated arm's are near
+    for candidate in _postures(published, T_base_flange, near):
         q = candidate + 2 * math.pi * np.round((near - candidate) / (2 * math.pi))
         q = np.where(q > JOINT_LIMIT_RAD, q - 2 * math.pi, np.where(q < -JOINT_LIMIT_RAD, q + 2 * math.pi, q))
         distance = float(np.sum((q - near) ** 2))

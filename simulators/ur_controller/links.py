@@ -192,7 +192,7 @@ class LineLink(Link):
     def __init__(self, connection: socket.socket, server: Server) -> None:
         super().__init__(connection)
         self._server = server
-        self._dashboard = Dashboard(server.controller, server.interpreter)
+        self._dashboard = Dashboard(server.controller, server.interpreter, server.words)
         self._rest = b""
         if not server.faulty(self, "dashboard_connect"):
             self.send(f"{WELCOME}\n".encode())

@@ -13,6 +13,7 @@ from simulators.connection import accept
 from simulators.serve import SimulatorError, Termination, listening
 from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
+from simulators.ur_controller.dashboard import Words
 from simulators.ur_controller.links import EARLY_S, LineLink, Link, PendantLink, PrimaryLink, RtdeLink, ScriptLink
 from simulators.ur_controller.program import Interpreter
 from simulators.world_link import WorldLink
@@ -39,8 +40,10 @@ class Server:
         *,
         cut_off_s: float = CUT_OFF_S,
         fieldbus: bool = False,
+        words: Words | None = None,
     ) -> None:
         self.controller = controller
+        self.words = words  # of a recorded dashboard
         self.reserved = _FIELDBUS if fieldbus else frozenset[str]()  # registers that no client may write
         self._cut_off_s = cut_off_s
         self.interpreter = Interpreter(controller)

@@ -232,16 +232,16 @@ Capture(0xd2c2): error 2002 on query.
 
 
 def test_a_listing_is_transcribed_without_what_names_a_person() -> None:
-    assert transcribe(LISTING, "here").splitlines() == [
-        "# Source: here",
-        "Model: ILCE-1M2",
-        "Firmware: 3.00",
-        "Protocol: 300",
-        "Controls: d2c2",
-        "5005 u16 rw enum 2 4 32785 = 4",
-        "d1ce str rw none = ",
-        "d07b str ro none = FE 28mm F2",
-        "d218 i8 ro range -1 100 1 = -1",
-        "5007 u16 rw range 100 100 1 = 65534",
-        "d253 u8 rw enum = 1",
+    recording = transcribe(LISTING, "here")
+    listing = recording.devices["camera"].answers.listing
+    assert listing is not None
+    assert (recording.source, listing.model, listing.firmware, listing.protocol) == ("here", "ILCE-1M2", "3.00", 300)
+    assert listing.controls == ("d2c2",)
+    assert [(one.code, one.type, one.access, one.form, one.numbers, one.value) for one in listing.properties] == [
+        ("5005", "u16", "rw", "enum", (2, 4, 32785), 4),
+        ("d1ce", "str", "rw", "none", (), ""),
+        ("d07b", "str", "ro", "none", (), "FE 28mm F2"),
+        ("d218", "i8", "ro", "range", (-1, 100, 1), -1),
+        ("5007", "u16", "rw", "range", (100, 100, 1), 65534),
+        ("d253", "u8", "rw", "enum", (), 1),
     ]

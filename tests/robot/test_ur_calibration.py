@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import struct
 
 import numpy as np
 import pytest
 
+from drivers.interfaces import answers_of
 from drivers.ur.primary import ControllerKinematics, calibration_of, take_kinematics
 from service.core.arms.known import arm_model
 from simulators.ur_controller.kinematics import MODELS
@@ -67,3 +69,12 @@ def test_the_driver_reports_it_and_does_without_it() -> None:
         assert arm.report().details["calibration"].startswith("the calibration is not stated: timed out")
         assert arm.report().problems == ()
     assert "not stated: Connection refused" in calibration_of("127.7.77.77", 1.0)(UR10E, HOME)
+
+
+def test_the_calibration_is_asked_for_by_the_report_and_not_to_open_the_arm() -> None:
+    """Before, each opening asked: the second client of the primary interface was the first who wanted to know."""
+    plan = json.dumps([{"device": "robot", "on": "primary", "kind": "drop", "nth": 2}])
+    with simulated_ur(address(72), "--faults", plan), opened(address(72)) as arm:
+        assert answers_of(arm).samples[0].source == "primary interface, kinematics"
+        told = [arm.report().details["calibration"] for _ in range(2)]
+    assert told == ["the calibration is not stated: the interface answers without it"] * 2

@@ -67,6 +67,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
     "orthocapture protocol check protocols/dry_run.yaml": succeeds,
     "orthocapture doctor --rig rig.yaml": succeeds,
+    "orthocapture doctor --rig rig.yaml --record devices.json": succeeds,
     "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
     '--operator "A. Name" --specimen "Spine 7"': starts_and_is_aborted,
     'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
@@ -302,6 +303,18 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture simulate nikon": (
         "tests/camera/test_recorded_nikons.py::test_a_recorded_body_is_driven_or_refused_in_words_that_help"
+    ),
+    "orthocapture simulate camera --replay devices.json": (
+        "tests/recording/test_round_trips.py::test_a_body_is_the_same_on_the_replay_of_its_recording"
+    ),
+    "orthocapture simulate nikon --replay devices.json": (
+        "tests/recording/test_round_trips.py::test_a_body_is_the_same_on_the_replay_of_its_recording"
+    ),
+    "orthocapture simulate ur --replay devices.json": (
+        "tests/recording/test_round_trips.py::test_an_arm_is_the_same_on_the_replay_of_its_recording"
+    ),
+    "orthocapture simulate rig --scene 7 --dir rig --replay devices.json": (
+        "tests/recording/test_doctor_records.py::test_a_whole_rig_is_the_same_on_its_replay"
     ),
     "orthocapture simulate kuka": "tests/kuka/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (

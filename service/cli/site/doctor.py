@@ -24,6 +24,7 @@ from service.cli.common import (
 )
 from service.cli.run.commands import RigOption
 from service.cli.shipped_protocols import protocol_file
+from service.cli.site.record_devices import record_devices
 from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.equipment.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
@@ -56,6 +57,12 @@ def doctor_command(
     protocol: Annotated[
         Path | None, typer.Option("--protocol", help="Check that the disk has room for a run of this protocol.")
     ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            "--record", metavar="FILE", help="Write what every device says into a file, without personal data."
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Open every device of a rig; report versions, clock offsets, free space and problems."""
@@ -64,6 +71,8 @@ def doctor_command(
         loaded = None if protocol is None else load_protocol(protocol_file(protocol), params_models()).protocol
         station = Station(rig_file)
         found = _reports(station, quiet=json)
+        if record is not None:
+            record_devices(station, record, SystemClock(), quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
         free_bytes = shutil.disk_usage(existing).free
         place = _second_place(rig_file, data)
