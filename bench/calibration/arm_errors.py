@@ -117,15 +117,15 @@ def as_markdown(record: dict[str, Any]) -> str:
     lines = [
         f"# Hand-eye calibration of arms that err in different ways, {record['date']}",
         "",
-        f"Commit {record['commit']}. UR10e; geometry only: a board of 24 × 17 squares of 15 mm at 4752 × 3168 px (the "
-        "demonstration: 1280 × 853 px), images that show it whole, corner noise 0.05 px for each axis, its size exactly "
-        "known, repeatability of the arm 0.02 mm rms. Errors: `factory`, an arm as built whose controller lacks its "
-        "factory calibration (drawn from thirteen published ones); `gears`, above all periodic errors of gears; "
-        "`both`. RMS error (mm) of where the camera puts the scene's centre over the 108 viewpoints of the data set "
-        "(the demonstration: 16): as it is, and without the arm's scatter (its worst viewpoint beside it). Held-out: "
-        "what the calibration states of itself, rms over boards that it did not use. Mount: the camera's place on the "
-        "flange against its stated sigma (rms over the arms, and the worst), with the flange where the controller has "
-        "it (errors of the last link cannot be told from the mount).",
+        f"Commit {record['commit']}. UR10e; geometry only: a board of 24 × 17 squares of 15 mm at 4752 × 3168 px "
+        "(the demonstration: 1280 × 853 px), images that show it whole, corner noise 0.05 px for each axis, its size "
+        "exactly known, repeatability of the arm 0.02 mm rms. Errors: `factory`, an arm as built whose controller "
+        "lacks its factory calibration (drawn from thirteen published ones); `gears`, above all periodic errors of "
+        "gears; `both`. RMS error (mm) of where the camera puts the scene's centre over the 108 viewpoints of the "
+        "data set (the demonstration: 16): as it is, and without the arm's scatter (its worst viewpoint beside it). "
+        "Held-out: what the calibration states of itself, rms over boards that it did not use. Mount: the camera's "
+        "place on the flange against its stated sigma (rms over the arms, and the worst), with the flange where the "
+        "controller has it (errors of the last link cannot be told from the mount).",
         "",
         "| errors | session | arms | plain: median | corrected: median | worst | without scatter: median | worst | "
         "worst viewpoint | held-out: median | error / held-out: worst | mount: rms sigmas | worst |",
