@@ -23,6 +23,7 @@ from bench.machine import RESULTS, commit, machine
 from service.compute.arm.correction import CorrectedMounting
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.core.arms.known import arm_model
+from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, transform
 from service.core.units import mm
 from simulators.scene.arm import ARM_ERRORS, ArmErrorKind, UniversalRobot
@@ -54,22 +55,26 @@ def one(kind: ArmErrorKind, session: str, seed: int) -> dict[str, Any]:
     images = SESSIONS[session]
     views = plan(scene, images.protocol, *CAPTURES)
     seen = board_session(scene, plan(scene, images.protocol, *images.steps), width=images.width)
-    begun_s = time.monotonic()
-    result = calibrate_hand_eye(
-        HandEyeViews(
-            seen.T_base_flange,
-            seen.T_camera_board,
-            corners=seen.corners,
-            joints_rad=seen.joints_rad,
-            arm=arm_model(scene.arm.name),
-        )
-    )
-    reported = np.array([scene.nominal_flange(shot.q) for shot in views])
     row: dict[str, Any] = {
         "errors": kind,
         "session": session,
         "seed": seed,
         "images": len(seen.T_base_flange),
+    }
+    begun_s = time.monotonic()
+    found = HandEyeViews(
+        seen.T_base_flange,
+        seen.T_camera_board,
+        corners=seen.corners,
+        joints_rad=seen.joints_rad,
+        arm=arm_model(scene.arm.name),
+    )
+    try:
+        result = calibrate_hand_eye(found)
+    except ComputeError as error:
+        return row | {"refused": str(error)}
+    reported = np.array([scene.nominal_flange(shot.q) for shot in views])
+    row |= {
         "plain_mm": scene_error_mm(scene, views, reported @ result.T_flange_camera),
         "seconds": time.monotonic() - begun_s,
     }
@@ -141,7 +146,11 @@ def as_markdown(record: dict[str, Any]) -> str:
             def of(key: str, rows: list[dict[str, Any]] = done) -> Array:
                 return np.array([row[key] for row in rows])
 
-            cells = [np.median(of("plain_mm", rows)), np.median(of("corrected_mm")), of("corrected_mm").max()]
+            cells = [
+                np.median(of("plain_mm", [row for row in rows if "plain_mm" in row])),
+                np.median(of("corrected_mm")),
+                of("corrected_mm").max(),
+            ]
             cells += [np.median(of("systematic_mm")), of("systematic_mm").max(), of("worst_mm").max()]
             cells += [np.median(of("held_out_mm"))]
             ratio = (of("corrected_mm") / of("held_out_mm")).max()

@@ -237,6 +237,7 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
         assert "Traceback" not in log
 
 
+@pytest.mark.slow
 def test_a_rig_has_the_camera_that_was_recorded(tmp_path: Path) -> None:
     with simulated_rig(tmp_path, *SMALL, "--recorded", "ilce-7rm5-2.02", host=OWN_HOST) as ready:
         camera = driver(load_rig(Path(ready["rig"])).section.devices["camera"]["port"])
@@ -248,6 +249,7 @@ def test_a_rig_has_the_camera_that_was_recorded(tmp_path: Path) -> None:
             camera.close()
 
 
+@pytest.mark.slow
 def test_only_a_sony_can_be_one_that_was_recorded(tmp_path: Path) -> None:
     words = ("--scene", "3", "--dir", str(tmp_path), "--camera", "Canon EOS R5", "--recorded", "ilce-7rm5-2.02")
     answer = orthocapture("simulate", "rig", *words)
