@@ -17,6 +17,7 @@ from typing import Any
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.whole_run import whole_run
 from simulators.scene.arm import ARM_ERRORS, ARM_ERRORS_USUAL
+from simulators.sony_camera.recorded import names as bodies
 from tests.support.protocols.shortened import shortened
 
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"
@@ -37,12 +38,14 @@ def main(words: Sequence[str] | None = None) -> int:
         "speed_up": options.speed_up,
         "arm": options.arm,
         "arm_errors": options.arm_errors,
+        "recorded": options.recorded,
     }
     stem = options.results / f"{options.name}-{options.image_width}-{options.date}"
     options.results.mkdir(parents=True, exist_ok=True)
     rig = ["--image-width", str(options.image_width), "--ct-voxel-mm", str(options.ct_voxel_mm),
            "--speed-up", str(options.speed_up), "--arm", options.arm, "--host", options.host,
-           "--arm-errors", options.arm_errors, "--patience", str(options.patience)]  # fmt: skip
+           "--arm-errors", options.arm_errors, "--patience", str(options.patience),
+           *(["--recorded", options.recorded] if options.recorded else [])]  # fmt: skip
     found: list[dict[str, Any]] = []
     text = ""
     for scene in scenes:
@@ -88,6 +91,9 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--arm-errors", choices=ARM_ERRORS, default=ARM_ERRORS_USUAL, help=f"of an UR10e ({ARM_ERRORS_USUAL})"
     )
+    parser.add_argument(
+        "--recorded", choices=bodies(), metavar="BODY", help="the camera states what this Sony was recorded to state"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address of its controller (127.0.0.1)")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="a protocol other than the paper's")
     parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one in N views (1)")
@@ -110,7 +116,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         f"Commit {record['commit']}; {computer['processor']}, {computer['cores']} cores, {computer['memory_gb']} GB, "
         f"{computer['system']}, Python {computer['python']}; photographs {record['image_width']} px wide, "
         f"CT voxels of {record['ct_voxel_mm']} mm, {record['arm']} {record['speed_up']:g} times as fast as real, "
-        f"with the errors `{record['arm_errors']}`.",
+        f"with the errors `{record['arm_errors']}`{_body(record['recorded'])}.",
         "",
         "The true error is the registration's displacement at the scene's centre against the simulator's record. "
         "Nobody was asked anything: the simulated technician did what the screen told him.",
@@ -120,6 +126,10 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         *_course(record["scenes"]),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _body(recorded: str | None) -> str:
+    return f"; the camera states what a real body was recorded to state (`{recorded}`)" if recorded else ""
 
 
 def _table(scenes: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 from simulators.gige_camera.registers import SERIAL
+from simulators.sony_camera.properties import Code
+from simulators.sony_camera.recorded import recorded_table
 
 CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon", "GigE Vision": "gige", "video": "video"}
 STILL = ("Sony ILCE-7RM5", "Canon EOS R5")  # with a button; a person can hold them, and they can be second cameras
 _LENS = {"aperture_f": 22.0, "lens": "50 mm", "focal_length_mm": 50.0}  # set by hand, as the protocols want it
+_ISO = 100  # as the protocols want it
 _LONGEST_FRAME_S = 30.0  # this camera renders its images
 _VIDEO_LATENCY_S = 2.0  # twice what the simulator holds a frame back at most, and a frame
 
@@ -23,6 +27,15 @@ def place(model: str, host: str, folder: Path) -> tuple[str, ...]:
             return "--pipe", str(folder / "video")
         case _:
             return "--port", "0"
+
+
+def as_recorded(body: str) -> tuple[str, ...]:
+    """The words for a Sony with the table of a recorded body; its ISO is set at the body if it lists no values."""
+    iso = next((one for one in recorded_table(body).properties if one.code == Code.ISO), None)
+    if iso is None or iso.choices != ():
+        return "--recorded", body
+    by_hand = [{"code": f"{Code.ISO:x}", "how": "value", "value": _ISO}]
+    return "--recorded", body, "--answers", json.dumps(by_hand)
 
 
 def again(ready: dict[str, Any], taken: int) -> tuple[str, ...]:

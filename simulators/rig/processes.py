@@ -19,7 +19,7 @@ import yaml
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
-from simulators.rig.cameras import CAMERAS, STILL, again, place, section
+from simulators.rig.cameras import CAMERAS, STILL, again, as_recorded, place, section
 from simulators.rig.deliveries import (
     add_delivery_arguments,
     check_delivery_arguments,
@@ -36,6 +36,7 @@ from simulators.scene.arm import ARM_ERRORS, ARM_ERRORS_USUAL
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, add_patience, announce
+from simulators.sony_camera.recorded import names as bodies
 
 _LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
@@ -56,6 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what the controller of an UR10e does not know of its arm: how it was built, its gears' errors, or both",
     )
     parser.add_argument("--camera", choices=tuple(CAMERAS), default="Sony ILCE-7RM5", help="model of the camera")
+    parser.add_argument(
+        "--recorded", choices=bodies(), metavar="BODY", help="what this Sony was recorded to state, instead"
+    )
     parser.add_argument("--version", default="5.12", help="of Polyscope")
     parser.add_argument(
         "--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one per station"
@@ -113,6 +117,8 @@ def serve(args: argparse.Namespace) -> None:
         raise SimulatorError("--second-camera-model names more cameras than --second-camera places")
     if args.camera not in STILL and (args.hand or len(args.second_camera_model) < len(args.second_camera)):
         raise SimulatorError(f"--camera {args.camera} can neither be held nor be a second camera: choose a still one")
+    if args.recorded and CAMERAS[args.camera] != "camera":
+        raise SimulatorError(f"--recorded is for a Sony: leave --camera {args.camera} out")
     check_delivery_arguments(args)
     replay = NOTHING if args.replay is None else replay_of(args.replay.resolve())
     if replay.arms:
@@ -189,6 +195,7 @@ class _Rig:
             "--world", world, "--image-width", str(self.args.image_width),
             "--exposures-log", str(self._exposures_log("camera")),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
+            *(as_recorded(self.args.recorded) if self.args.recorded else ()),
         )  # fmt: skip
         models = [*self.args.second_camera_model, *[self.args.camera] * len(self.further)]
         for (name, further), model in zip(self.further.items(), models, strict=False):

@@ -57,7 +57,7 @@ class SimulatedArm(Protocol):
 #: the published dimensions), what remains beside a calibration (above all the gears' errors), or both.
 ArmErrorKind = Literal["factory", "gears", "both"]
 ARM_ERRORS: tuple[ArmErrorKind, ...] = get_args(ArmErrorKind)
-ARM_ERRORS_USUAL: ArmErrorKind = "gears"
+ARM_ERRORS_USUAL: ArmErrorKind = "both"
 
 
 @dataclass(frozen=True, slots=True)

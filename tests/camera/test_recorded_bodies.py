@@ -17,6 +17,7 @@ from drivers.errors import DeviceRefusedError, DeviceStorageFullError, DeviceTim
 from drivers.gphoto.profile import battery_fraction
 from drivers.gphoto.profiles import profile_for
 from drivers.interfaces import CameraSettings
+from simulators.rig.cameras import as_recorded
 from simulators.sony_camera.answers import HOWS
 from simulators.sony_camera.recorded import names, recorded_table
 from tests.support.rig.gphoto_rig import PAPER, gphoto_rig
@@ -81,6 +82,13 @@ def test_a_recorded_body_is_driven_or_refused_in_words_that_help(body: str, tmp_
     assert report.details["profile"] == "sony_ilce"
     problems = "; ".join(report.problems)
     assert re.search(told.problems, problems) if told.problems else not problems
+
+
+def test_a_recorded_body_whose_iso_was_set_by_hand_takes_the_settings_of_the_paper(tmp_path: Path) -> None:
+    """What the driver asks a person to do; so the body of a simulated rig is prepared."""
+    with rig([], "--fast", *as_recorded("ilce-7rm5-2.02")) as (camera, _):
+        assert camera.apply(PAPER) == PAPER
+        assert camera.capture(tmp_path).exif == PAPER
 
 
 @pytest.mark.parametrize("body", names())

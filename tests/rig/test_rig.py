@@ -26,6 +26,7 @@ from service.station import Station
 from service.store.store import Store
 from tests.support.processes.forked import Forked
 from tests.support.processes.waiting import until
+from tests.support.rig.gphoto_rig import PAPER, driver
 from tests.support.rig.patience import PATIENT_UR
 from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
 
@@ -234,6 +235,26 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
         log = (tmp_path / "rig.log").read_text()
         assert "camera ended with status -9" in log
         assert "Traceback" not in log
+
+
+@pytest.mark.slow
+def test_a_rig_has_the_camera_that_was_recorded(tmp_path: Path) -> None:
+    with simulated_rig(tmp_path, *SMALL, "--recorded", "ilce-7rm5-2.02", host=OWN_HOST) as ready:
+        camera = driver(load_rig(Path(ready["rig"])).section.devices["camera"]["port"])
+        try:
+            camera.open()
+            assert camera.report().identity.firmware == "2.02"
+            assert camera.apply(PAPER) == PAPER, "its ISO, of which it lists no values, was set by hand"
+        finally:
+            camera.close()
+
+
+@pytest.mark.slow
+def test_only_a_sony_can_be_one_that_was_recorded(tmp_path: Path) -> None:
+    words = ("--scene", "3", "--dir", str(tmp_path), "--camera", "Canon EOS R5", "--recorded", "ilce-7rm5-2.02")
+    answer = orthocapture("simulate", "rig", *words)
+    assert answer.returncode != 0
+    assert "--recorded is for a Sony" in answer.stderr
 
 
 def test_sigterm_also_ends_a_ct_scan_that_is_under_way(tmp_path: Path) -> None:

@@ -114,6 +114,18 @@ def test_every_posture_reaches_the_pose_and_the_given_one_is_among_them(q: Array
     assert apart.min() < 1e-5
 
 
+def test_shoulder_elbow_and_wrist_keep_their_sides_though_the_camera_must_turn_far() -> None:
+    """Before, the demonstration's last board image turned the wrist over, and at station 2 every way was blocked."""
+    before = np.array([4.97, -1.56, 1.04, -1.21, -1.96, -6.17])  # the camera cannot turn on: its limit is near
+    T = forward(ARM, np.array([[2.62, -2.57, 1.52, -3.51, 1.13, -5.59]]))[0]
+    found = nearest_posture(ARM, T, before)
+    assert found is not None
+    np.testing.assert_allclose(forward(ARM, found[None])[0], T, atol=1e-9)
+    assert np.sign(np.sin(found[4])) == np.sign(np.sin(before[4]))
+    assert np.sign(found[2]) == np.sign(before[2])
+    assert found[5] - before[5] > 3.0
+
+
 def test_the_nearest_posture_turns_no_joint_by_a_needless_revolution() -> None:
     q = np.array([4.5, -1.7, 1.4, -1.4, -1.5, -6.0])
     T = forward(ARM, q[None])[0]

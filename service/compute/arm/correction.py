@@ -164,6 +164,8 @@ def _dh_tolerances(arm: ArmModel) -> Array:
     another mount of the camera. They stay in T_flange_camera, for whose purpose they are no errors.
     """
     of = np.tile(arm.tolerances.dh, (arm.axes, 1))
+    if arm.tolerances.lengths_m:
+        of[:, :2] = arm.tolerances.lengths_m
     if arm.tolerances.twists_rad:
         of[:, 2] = arm.tolerances.twists_rad
     of[-1] = 0.0

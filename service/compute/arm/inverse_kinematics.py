@@ -11,6 +11,9 @@ from service.core.arms.model import ArmModel
 from service.core.geometry import Array, Transform, inverse
 
 _REACH_TOLERANCE = 1e-9
+# Of the squared turns. The last joint turns little but the camera about itself: a whole turn of it is better than
+# another side of shoulder, elbow or wrist, from which the ways to the next poses are long or blocked.
+_WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.25])
 
 
 def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
@@ -27,7 +30,8 @@ def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
 def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
     """Joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
 
-    With seven axes nearness is weighed against room to limits and singularities.
+    The turn of the last of six axes counts half. With seven axes nearness is weighed against room to limits and
+    singularities.
     """
     if arm.family == "seven_axes":
         return seven_axes.postures_by_cost(arm, T_base_flange, near_rad)
@@ -35,7 +39,7 @@ def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> A
     found = found + 2 * np.pi * np.round((near_rad - found) / (2 * np.pi))
     found = np.where(np.abs(found) > arm.limits_rad, found - 2 * np.pi * np.sign(found), found)
     found = found[np.all(np.abs(found) <= arm.limits_rad, axis=1)]
-    return found[np.argsort(np.sum((found - near_rad) ** 2, axis=1), kind="stable")]
+    return found[np.argsort((found - near_rad) ** 2 @ _WEIGHTS, kind="stable")]
 
 
 def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:

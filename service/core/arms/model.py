@@ -35,10 +35,11 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class ArmTolerances:
-    """Usual errors of an arm's geometry, one standard deviation; a calibration estimates their common scale.
+    """Usual errors of an arm's geometry, one standard deviation; a calibration estimates a scale of each kind.
 
     Attributes:
         dh: of a, d (metres), α, θ (radians) of each joint.
+        lengths_m: of a and d, joint by joint; empty: those of `dh` for all.
         twists_rad: of α, joint by joint; empty: that of `dh` for all.
         parallel_rad: of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
         gear_rad: amplitude of each harmonic of a gear's error.
@@ -46,6 +47,7 @@ class ArmTolerances:
     """
 
     dh: tuple[float, float, float, float] = (0.2e-3, 0.2e-3, float(np.radians(0.015)), float(np.radians(0.04)))
+    lengths_m: tuple[tuple[float, float], ...] = ()
     twists_rad: tuple[float, ...] = ()
     parallel_rad: float = float(np.radians(0.015))
     gear_rad: float = float(np.radians(0.01))

@@ -65,7 +65,7 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.calibration.calibrate:calibrate",
     words="camera calibration",
-    version=4,  # knows arms whose axes are twisted as factory calibrations show
+    version=5,  # its prior of an arm's lengths, joint by joint, keeps their scale from vanishing with few images
     order=12,
     demand=lambda arguments: Demand(
         memory_mb=800 + 5 * len(arguments.images), limit_s=3600 + 60 * len(arguments.images)

@@ -21,6 +21,8 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
+from service.compute.arm.inverse_kinematics import nearest_posture
+from service.core.arms.known import known_arm
 from service.core.geometry import Array, Transform
 from service.core.records.events import ViewpointFailed
 from service.core.units import megapixels
@@ -317,8 +319,15 @@ class _CaptureLoop:
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
         """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
-        near = robot.state().sample.joints_rad if viewpoint.joints_rad is None else viewpoint.joints_rad
-        return robot.solve_ik(flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), near)
+        target = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera)
+        near = viewpoint.joints_rad
+        if near is None:  # not planned: in the posture that a plan would take, not in one that is as near by its sum
+            here = robot.state().sample.joints_rad
+            collision, _ = self.context.devices.surroundings()
+            model = known_arm(collision.arm or robot.report().identity.model)
+            own = None if model is None or model.axes != len(here) else nearest_posture(model, target, here)
+            near = here if own is None else own
+        return robot.solve_ik(target, near)
 
     def _solve_ahead(self, robot: RobotArm, later: Sequence[Viewpoint]) -> None:
         """Solve for the next viewpoint's joints while the arm rests before the exposure, which takes 0.1 s."""

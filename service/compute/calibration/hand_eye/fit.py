@@ -32,6 +32,7 @@ from service.compute.calibration.hand_eye.closed_form import (
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, solve_reprojection
 from service.compute.calibration.hand_eye.weighted import (
     FLOOR_M,
+    GEOMETRY_KINDS,
     BoardViews,
     Fit,
     Noise,
@@ -329,17 +330,17 @@ def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTe
 
 
 def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
-    """(P,) 0 for a length or zero of the geometry, 1 for a twist, 2 for one of the gears."""
-    geometry = np.concatenate([np.tile([0, 0, 1, 0], arm.axes), np.ones(len(arm.parallel))]).astype(np.int64)
+    """(P,) 0 for a length of the geometry, 1 for a twist, 2 for the zero of a joint, 3 for one of the gears."""
+    geometry = np.concatenate([np.tile([0, 0, 1, 2], arm.axes), np.ones(len(arm.parallel))]).astype(np.int64)
     if terms == "geometry":
         return geometry
-    return np.concatenate([geometry, np.full(gear_count(arm), 2, dtype=np.int64)])
+    return np.concatenate([geometry, np.full(gear_count(arm), GEOMETRY_KINDS, dtype=np.int64)])
 
 
 def _groups(arm: ArmModel) -> NDArray[np.int64]:
-    """(P,) group of each parameter: 0 and 1 for the geometry, then one for each harmonic of each joint."""
+    """(P,) group of each parameter: its kind for the geometry, then one for each harmonic of each joint."""
     joints, waves = np.arange(arm.axes)[:, None, None], np.arange(arm.tolerances.harmonics)
-    gears = np.broadcast_to(2 + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
+    gears = np.broadcast_to(GEOMETRY_KINDS + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
     return np.concatenate([_kinds(arm, "geometry"), gears.ravel()])
 
 

@@ -42,6 +42,10 @@ _SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix
 _COMMON = 13  # parameters before the arm's: two transforms and the board's scale
 _SCALE = 12  # index of the board's scale among them
 _LEAST_SIGMA = 1e-9  # of the scale: a board known to 1e-9 is exactly known
+#: Scales of the arm's geometry are about 1, for its tolerances were measured on such arms. This counts as much as so
+#: many parameters that are known: few images show few lengths, and these can by chance be right.
+GEOMETRY_KINDS = 3  # lengths, twists, zeros of joints: the first scales
+_KNOWN_ARMS = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,6 +274,8 @@ def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float
         value = np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))) + 0.5 * np.sum(np.log(prior)) + log_H
         value += 0.5 * (np.sum(left**2) + np.sum(step[_COMMON:] ** 2 / prior))
         value += 0.5 * views.size_precision * (near.scale - 1 + step[_SCALE]) ** 2
+        squares = np.array(noise.scales[:GEOMETRY_KINDS]) ** 2
+        value += 0.5 * _KNOWN_ARMS * np.sum(np.log(squares) + 1 / squares)
         # d/dV of each term, only the diagonal: the robot's variances are diagonal.
         inverse_L = np.linalg.inv(L)
         trace = np.sum(inverse_L**2, axis=1)
@@ -277,7 +283,10 @@ def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float
         A = solved[:, :, :-1]
         slope = trace - np.sum((A @ covariance) * A, axis=2) - solved[:, :, -1] ** 2
         robot = [noise.robot_m**2 * slope[:, :3].sum(), noise.robot_rad**2 * slope[:, 3:].sum()]
-        scales = members @ (1 - (np.diag(covariance)[_COMMON:] + step[_COMMON:] ** 2) / prior) if len(prior) else []
+        scales = np.zeros(len(members))
+        if len(prior):
+            scales += members @ (1 - (np.diag(covariance)[_COMMON:] + step[_COMMON:] ** 2) / prior)
+            scales[:GEOMETRY_KINDS] += _KNOWN_ARMS * (1 - 1 / squares)
         return float(value), np.array([*robot, *scales])
 
     first = np.log([max(start.robot_m, floor_m), max(start.robot_rad, floor_m), *start.scales])
@@ -311,14 +320,15 @@ def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np
     gram = _with_prior(_grams(views, noise, near).sum(axis=0), views, near.scale)
     members = (groups == np.arange(groups.max() + 1)[:, None]).astype(np.float64)
     size = members.sum(axis=1)
+    known = np.where(np.arange(len(size)) < GEOMETRY_KINDS, _KNOWN_ARMS, 0.0)
     square = np.array([float(np.mean(_prior(noise, views.kind)[groups == g])) for g in range(len(size))])
     for round_ in range(_SELECTION_ROUNDS):
         step, covariance, _ = _minimum(gram, square[groups])
         energy, spread = members @ step[_COMMON:] ** 2, members @ np.diag(covariance)[_COMMON:]
         if round_ < _SELECTION_ROUNDS // 2:
-            square = (energy + spread) / size
+            square = (energy + spread + known) / (size + known)
         else:
-            square = energy / np.maximum(size - spread / square, 1e-3)
+            square = (energy + known) / np.maximum(size - spread / square + known, 1e-3)
         square = np.clip(square, 1e-6, 1e4)
     return Noise(noise.robot_m, noise.robot_rad, tuple(float(v) for v in np.sqrt(square)))
 

@@ -21,10 +21,12 @@ _ALLOWED = frozenset(
 # state no acceleration, and for some joints a little more speed: 180°/s, or 360°/s.
 _SPEED_RAD_S, _ACCELERATION_RAD_S2 = 3.14, 40.0
 _BRAKING_RAD_S2 = 4.0  # of a program that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
-# Spread of thirteen published factory calibrations, for a controller that lacks its own; the zeros of the joints are
-# right in all of them. Between forearm and wrist 1 the axes are turned by up to 0.76°.
+# Spread of thirteen published factory calibrations, for a controller that lacks its own, and 0.1 mm for what these do
+# not show; the zeros of the joints are right in all of them. Between forearm and wrist 1 the axes are turned by up to
+# 0.76°. Offsets 2 and 3 are along the same direction as 4, which stands for all three.
 _TOLERANCES = ArmTolerances(
     dh=(0.2e-3, 0.3e-3, float(np.radians(0.05)), float(np.radians(0.04))),
+    lengths_m=((1.6e-4, 2.0e-4), (3.3e-4, 1e-4), (2.5e-4, 1e-4), (1.1e-4, 6.5e-4), (1.3e-4, 1.3e-4), (1e-4, 6e-4)),
     twists_rad=tuple(float(v) for v in np.radians([0.05, 0.08, 0.34, 0.06, 0.05, 0.05])),
     parallel_rad=float(np.radians(0.08)),
 )
