@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
+from service.compute.ground_truth.distances import chamfer as compared
+from service.compute.ground_truth.distances import sampling
 from service.compute.ground_truth.distances.chamfer import ChamferSettings, chamfer
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import sample
@@ -126,6 +128,30 @@ def test_the_score_is_that_of_brute_force_over_the_same_samples() -> None:
     assert score.pred_to_gt.excluded == int(np.sum(forth > 0.006)) > 0
     p, r = float(np.mean(forth <= 1e-3)), float(np.mean(back <= 1e-3))
     assert score.f_scores[1] == pytest.approx(2 * p * r / (p + r))
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_of_many_samples_some_are_compared_with_all_in_whatever_order_the_faces_are(
+    monkeypatch: pytest.MonkeyPatch, shuffled: bool
+) -> None:
+    monkeypatch.setattr(sampling, "_BLOCK", 300)
+    monkeypatch.setattr(compared, "MOST_COMPARED", 1000)
+    rng = np.random.default_rng(7)
+    pred, gt = (
+        Surface(of.vertices_m, rng.permutation(of.faces) if shuffled else of.faces)
+        for of in (shifted(BUMPY, (0.004, 0.002, -0.003)), BALL)
+    )
+    rng = np.random.default_rng(COARSE.seed)
+    a, b = sample(pred, COARSE.spacing_m, rng), sample(gt, COARSE.spacing_m, rng)
+    score = chamfer(pred, gt, COARSE)
+    for way, of, all_of_other in ((score.pred, a, b), (score.gt, b, a)):
+        assert 900 < len(way.samples.points_m) <= 1000 < len(of.points_m) / 2
+        number = cdist(way.samples.points_m, of.points_m).argmin(axis=1)
+        assert np.array_equal(of.points_m[number], way.samples.points_m)
+        assert np.array_equal(of.origin[number], way.samples.origin)
+        assert len(np.unique(number)) == len(number)
+        nearest = cdist(way.samples.points_m, all_of_other.points_m).min(axis=1)
+        assert way.distance_m == pytest.approx(nearest, rel=1e-12)
 
 
 @given(seed=st.integers(0, 1000), n=st.integers(1, 60), spread=st.floats(0.001, 0.1))

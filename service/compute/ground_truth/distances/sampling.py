@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,17 +57,22 @@ class BlockedSamples:
             self._draws.append(copy.deepcopy(rng))
             rng.random((2, min(_BLOCK, self.n - begin), 1))  # those of the block, which is made later
 
-    def blocks(self) -> Iterator[Samples]:
-        """All samples in order, in blocks of up to a million; the same ones each time."""
+    def blocks(self, some: Callable[[int], IntArray] | None = None) -> Iterator[Samples]:
+        """All samples in order, in blocks of up to a million; the same ones each time.
+
+        `some` chooses from each block by their numbers in it (K,), in order, given how many it has.
+        """
         for number, begin in enumerate(range(0, self.n, _BLOCK)):
-            end = min(begin + _BLOCK, self.n)
+            count = min(_BLOCK, self.n - begin)
+            chosen = np.arange(count) if some is None else some(count)
             if not self._surface.is_mesh:
                 of = self._cloud
-                normals = None if of.normals is None else of.normals[begin:end]
-                yield Samples(of.points_m[begin:end], of.origin[begin:end], normals)
+                normals = None if of.normals is None else of.normals[begin + chosen]
+                yield Samples(of.points_m[begin + chosen], of.origin[begin + chosen], normals)
                 continue
-            origin = np.searchsorted(self._upto, np.arange(begin, end), side="right")
-            yield Samples(random_places(self._surface, origin, copy.deepcopy(self._draws[number])), origin, None)
+            origin = np.searchsorted(self._upto, begin + chosen, side="right")
+            drawn = copy.deepcopy(self._draws[number]).random((2, count))
+            yield Samples(_places(self._surface, origin, drawn if some is None else drawn[:, chosen]), origin, None)
 
 
 def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:
@@ -115,15 +120,27 @@ def normals_at(surface: Surface, origin: IntArray) -> Array | None:
 
 def random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
     """(K, 3) one random point on each of these faces (K,)."""
-    drawn = rng.random((2, len(faces), 1))
+    return _places(surface, faces, rng.random((2, len(faces))))
+
+
+def _places(surface: Surface, faces: IntArray, drawn: Array) -> Array:
+    """(K, 3) the point on each of these faces (K,) that two numbers drawn from 0 to 1 (2, K) stand for."""
     out = np.empty((len(faces), 3))
     for begin in range(0, len(faces), _PLACES):
-        part = slice(begin, begin + _PLACES)
-        a, b, c = (surface.vertices_m[surface.faces[faces[part], k]] for k in range(3))
-        u, v = drawn[:, part]
+        of, (u, v) = faces[begin : begin + _PLACES], drawn[:, begin : begin + _PLACES]
         folded = u + v > 1
         u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-        out[part] = a + u * (b - a) + v * (c - a)
+        first, last = int(of.min()), int(of.max())
+        if last - first < len(of):  # samples of few faces in a row: each face's edges are computed once
+            corners, at = surface.faces[first : last + 1], of - first
+        else:
+            corners, at = surface.faces[of], None
+        a, b, c = (surface.vertices_m[corners[:, k]] for k in range(3))
+        for k in range(3):
+            one, other, third = a[:, k], b[:, k] - a[:, k], c[:, k] - a[:, k]
+            if at is not None:
+                one, other, third = one[at], other[at], third[at]
+            out[begin : begin + _PLACES, k] = one + u * other + v * third
     return out
 
 

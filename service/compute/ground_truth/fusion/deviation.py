@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg
 
 from service.compute.ground_truth.fusion.overlap import Mask
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.ground_truth.surface import FACES, IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
@@ -90,7 +90,7 @@ def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
     neighbours. Faces that still turn over move as one piece with what is around them.
     """
     points = surface.vertices_m + move_m
-    folded = _folded(surface, points)
+    folded = _folded(surface, points, np.arange(len(surface.faces)))
     if not len(folded):
         return Surface(points, surface.faces), 0
     links = adjacency(surface)
@@ -101,24 +101,26 @@ def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
         for _ in range(rings):
             around += links @ around
         chosen = np.flatnonzero(around)
+        mean = means[chosen]
         fixed = surface.vertices_m if rings else np.zeros_like(points)
         for _ in range(_AVERAGED):
             move = points - fixed
-            points[chosen] = fixed[chosen] + 0.5 * (move[chosen] + means[chosen] @ move)
-        folded = _folded(surface, points)
+            points[chosen] = fixed[chosen] + 0.5 * (move[chosen] + mean @ move)
+        folded = _folded(surface, points, np.flatnonzero(surface.touching(around > 0)))  # the others lie as before
         if not len(folded):
             return Surface(points, surface.faces), 0
+    still = folded
     for rings in _STIFF:
         share, piece = _pieces(surface, links, folded, rings)
         move = points - surface.vertices_m
         whole = np.maximum(np.bincount(piece, share), 1.0)  # 0 for vertices of no piece, whose share is 0 too
         mean = np.stack([np.bincount(piece, share * move[:, k]) / whole for k in range(3)], axis=1)
         points = points + share[:, None] * (mean[piece] - move)
-        still = _folded(surface, points)
+        still = _folded(surface, points, np.flatnonzero(surface.touching(share > 0)))
         if not len(still):
             return Surface(points, surface.faces), 0
         folded = np.union1d(folded, still)  # those that lie straight now stay in their pieces
-    return Surface(points, surface.faces), len(_folded(surface, points))
+    return Surface(points, surface.faces), len(still)
 
 
 def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -> tuple[Array, IntArray]:
@@ -167,11 +169,12 @@ def _usual_edge(surface: Surface) -> float:
     return float(np.median(lengths))
 
 
-def _folded(surface: Surface, points_m: Array) -> IntArray:
-    """Indices of the faces whose normal turns by more than a right angle when the vertices move to these points."""
+def _folded(surface: Surface, points_m: Array, of: IntArray) -> IntArray:
+    """Those of some faces whose normal turns by more than a right angle when the vertices move to these points."""
     moved = Surface(points_m, surface.faces)
-    folded = np.empty(len(surface.faces), dtype=np.bool_)
-    for block in surface.blocks():
-        after, before = moved.area_vectors_of(block), surface.area_vectors_of(block)
-        folded[block] = np.einsum("fi,fi->f", after, before) < 0
-    return np.flatnonzero(folded)
+    folded = np.empty(len(of), dtype=np.bool_)
+    for begin in range(0, len(of), FACES):
+        part = slice(begin, begin + FACES)
+        after, before = moved.area_vectors_of(of[part]), surface.area_vectors_of(of[part])
+        folded[part] = np.einsum("fi,fi->f", after, before) < 0
+    return of[folded]

@@ -188,7 +188,7 @@ def outside(surface: Surface, region: Region) -> Surface:
     inside = region.contains(surface.vertices_m)
     if not inside.any():
         return compact(surface.vertices_m, surface.faces)[0]
-    return compact(surface.vertices_m, surface.faces[~inside[surface.faces].any(axis=1)])[0]
+    return compact(surface.vertices_m, surface.faces[~surface.touching(inside)])[0]
 
 
 def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
@@ -211,11 +211,11 @@ class _Addition:
     def taken(self, carrier: Surface) -> Mask:
         """(F,) faces of the scan that are far from the CT, or touch what was taken away since."""
         far_m = 2 * self.settings.overlap.distance_m
-        vertices, faces = self.scan.vertices_m, self.scan.faces
+        vertices = self.scan.vertices_m
         far = PointIndex(carrier.vertices_m).nearest(vertices, far_m)[0] > far_m
-        taken: Mask = np.all(far[faces], axis=1)
+        taken: Mask = ~self.scan.touching(~far)
         if self.removed is not None:
-            taken |= np.any(self.removed.contains(vertices)[faces], axis=1)
+            taken |= self.scan.touching(self.removed.contains(vertices))
         return taken
 
 
