@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from service.core.geometry import Array, Transform, apply
 
 IntArray = NDArray[np.int64]
-FACES = 50_000  # in a block, so that what is computed of its corners stays in the processor's cache
+FACES = 25_000  # in a block, so that what is computed of its corners stays in the processor's cache
 
 
 @dataclass(frozen=True)

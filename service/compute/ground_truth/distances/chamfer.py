@@ -7,9 +7,8 @@ distances beyond 20 mm are excluded, and the means of the two directions are ave
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import chain, islice
+from itertools import chain
 
 import numpy as np
 
@@ -29,9 +28,6 @@ CHECKED = 100_000  # samples, taken at random, for the floor, the distance to th
 # Samples of one surface whose distances are measured, taken at random if there are more. The other surface keeps all
 # of its samples, so each distance stays the paper's; their mean gets a standard error of 1/1400 of their spread.
 MOST_COMPARED = 2_000_000
-# Blocks of samples in one tree. In a file whose faces have no spatial order, each block is spread over the whole
-# surface, so that each sample of the other surface has to look into each tree.
-_TOGETHER = 4
 _PREVIEW = 10  # of so many of them, one is looked at first: a good bound makes the search much faster
 
 
@@ -155,11 +151,10 @@ def _compared(samples: BlockedSamples, seed: int) -> Samples:
     """The samples whose distances are measured: all, or MOST_COMPARED at random, the same share of each block."""
     rng = np.random.default_rng([seed, samples.n])  # of its own: the other draws do not depend on it
     share = min(1.0, MOST_COMPARED / samples.n)
-
-    def some(n: int) -> IntArray:
-        return np.sort(rng.choice(n, int(np.floor(share * n)), replace=False))
-
-    kept = list(samples.blocks(some if share < 1 else None))
+    some: list[IntArray] | None = None
+    if share < 1:
+        some = [np.sort(rng.choice(n, int(np.floor(share * n)), replace=False)) for n in samples.sizes]
+    kept = list(samples.blocks(some))
     all_normals = [block.normals for block in kept if block.normals is not None]
     return Samples(
         np.concatenate([block.points_m for block in kept]),
@@ -178,20 +173,9 @@ def _nearest(
     one, own, other = queries
     found = NearestOfBlocks(one, outlier_m), NearestOfBlocks(own), NearestOfBlocks(other, outlier_m)
     first = Samples(some.points_m[::_PREVIEW], some.origin[::_PREVIEW], None)
-    for block in chain([first] if targets.n > MOST_COMPARED else [], _together(targets.blocks())):
+    for block in chain([first] if targets.n > MOST_COMPARED else [], targets.regions()):
         show(block.points_m, block.origin, found)
     return found
-
-
-def _together(blocks: Iterator[Samples]) -> Iterator[Samples]:
-    """The same samples in fewer, larger blocks, without normals."""
-    while some := list(islice(blocks, _TOGETHER)):
-        points_m, origin = (
-            np.concatenate([one.points_m for one in some]),
-            np.concatenate([one.origin for one in some]),
-        )
-        some.clear()
-        yield Samples(points_m, origin, None)
 
 
 def _mean(nearest: NearestOfBlocks) -> float:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
+from service.compute.ground_truth.distances.neighbours import spatial_order
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -15,7 +17,8 @@ from service.core.units import mm
 
 MOST_SAMPLES = 40_000_000  # of one surface; more are nearly always a mistaken unit
 _BLOCK = 1_000_000
-_PLACES = 50_000  # made at a time, which fits into the processor's cache
+_TOGETHER = 4  # blocks in a region
+_PLACES = 25_000  # made at a time, which fits into the processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +60,21 @@ class BlockedSamples:
             self._draws.append(copy.deepcopy(rng))
             rng.random((2, min(_BLOCK, self.n - begin), 1))  # those of the block, which is made later
 
-    def blocks(self, some: Callable[[int], IntArray] | None = None) -> Iterator[Samples]:
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many samples each block has."""
+        return tuple(min(_BLOCK, self.n - begin) for begin in range(0, self.n, _BLOCK))
+
+    def blocks(self, some: Sequence[IntArray] | None = None) -> Iterator[Samples]:
         """All samples in order, in blocks of up to a million; the same ones each time.
 
-        `some` chooses from each block by their numbers in it (K,), in order, given how many it has.
+        `some` chooses from each block by their numbers in it (K,), in order; a block of which none is wanted is left
+        out.
         """
-        for number, begin in enumerate(range(0, self.n, _BLOCK)):
-            count = min(_BLOCK, self.n - begin)
-            chosen = np.arange(count) if some is None else some(count)
+        for number, count in enumerate(self.sizes):
+            begin, chosen = number * _BLOCK, np.arange(count) if some is None else some[number]
+            if not len(chosen):
+                continue
             if not self._surface.is_mesh:
                 of = self._cloud
                 normals = None if of.normals is None else of.normals[begin + chosen]
@@ -73,6 +83,40 @@ class BlockedSamples:
             origin = np.searchsorted(self._upto, begin + chosen, side="right")
             drawn = copy.deepcopy(self._draws[number]).random((2, count))
             yield Samples(_places(self._surface, origin, drawn if some is None else drawn[:, chosen]), origin, None)
+
+    def regions(self) -> Iterator[Samples]:
+        """All samples, those together that lie together, without normals; a region is larger than a block.
+
+        In a file whose faces have no spatial order, each block is spread over the whole surface.
+        """
+        order = spatial_order(self._surface.vertices_m[self._surface.faces[:, 0]]) if self._surface.is_mesh else None
+        if order is None:
+            blocks = self.blocks()
+            while some := list(islice(blocks, _TOGETHER)):
+                points_m, origin = _joined(some)
+                yield Samples(points_m, origin, None)
+            return
+        count = np.diff(self._upto, prepend=0)
+        first = np.empty_like(count)  # samples that come before those of a face in this order
+        first[order] = np.cumsum(count[order]) - count[order]
+        region = np.empty(self.n, dtype=np.uint16)
+        for begin in range(0, self.n, _BLOCK):
+            at = np.arange(begin, min(begin + _BLOCK, self.n))
+            of = np.searchsorted(self._upto, at, side="right")
+            region[at] = (first[of] + at - (self._upto[of] - count[of])) // (_TOGETHER * _BLOCK)
+        for number in range(int(region.max()) + 1):
+            chosen = [np.flatnonzero(region[begin : begin + _BLOCK] == number) for begin in range(0, self.n, _BLOCK)]
+            points_m, origin = _joined(list(self.blocks(chosen)))
+            near = np.argsort(first[origin])
+            yield Samples(points_m[near], origin[near], None)
+
+
+def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
+    """Points and origins of several blocks, which are left out of the list so that they are not there twice."""
+    points_m = np.concatenate([block.points_m for block in some])
+    origin = np.concatenate([block.origin for block in some])
+    some.clear()
+    return points_m, origin
 
 
 def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:

@@ -54,13 +54,14 @@ class FieldLengths:
     reach_m: float = 0.006
 
 
-def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: FieldLengths) -> Array:
+def deviation_field(surface: Surface, links: csr_matrix, known_m: Array, known: Mask, lengths: FieldLengths) -> Array:
     """(V,) metres: follows `known_m` where it is `known`, and decays from there along the surface.
 
     It minimises the squared differences over the edges, with weights towards the known values and, elsewhere, 0.
 
     Args:
         surface: a mesh.
+        links: its `adjacency`.
         known_m: (V,) deviations, along the normals.
         known: (V,) where they count.
         lengths: of smoothing and decay.
@@ -68,7 +69,6 @@ def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: Fiel
     Raises:
         ComputeError: the solver does not converge.
     """
-    links = adjacency(surface)
     edge_m = _usual_edge(surface)
     pull = np.where(known, (edge_m / lengths.smoothing_m) ** 2, (edge_m / lengths.reach_m) ** 2)
     diagonal = np.asarray(links.sum(axis=1)).ravel() + pull
@@ -82,18 +82,19 @@ def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: Fiel
     return np.asarray(field, dtype=np.float64)
 
 
-def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
+def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = None) -> tuple[Surface, int]:
     """The surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
 
     Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
     neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
-    neighbours. Faces that still turn over move as one piece with what is around them.
+    neighbours. Faces that still turn over move as one piece with what is around them. `known` is the surface's
+    `adjacency`, if it was computed before.
     """
     points = surface.vertices_m + move_m
     folded = _folded(surface, points, np.arange(len(surface.faces)))
     if not len(folded):
         return Surface(points, surface.faces), 0
-    links = adjacency(surface)
+    links = adjacency(surface) if known is None else known
     means: csr_matrix = (diags(1 / np.maximum(np.asarray(links.sum(axis=1)).ravel(), 1.0)) @ links).tocsr()
     for rings in (*_ALIKE, *_ROUNDED):
         around = np.zeros(len(points))

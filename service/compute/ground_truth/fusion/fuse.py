@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.fusion.deviation import FieldLengths, deviation_field, moved_unfolded
+from service.compute.ground_truth.fusion.deviation import FieldLengths, adjacency, deviation_field, moved_unfolded
 from service.compute.ground_truth.fusion.overlap import (
     Mask,
     OverlapLimits,
@@ -133,9 +133,11 @@ def fuse(
     within = distance_to(carrier.vertices_m, ~usable, chosen.blend_m) / chosen.blend_m
     weight, detail = _smooth_step(within), _smooth_step((within - _DETAIL_FROM) / (1 - _DETAIL_FROM))
     known_m = np.where(usable, -seen.offset_m, 0.0)
-    followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
+    links = adjacency(carrier)
+    followed = deviation_field(carrier, links, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
     onto = seen.nearest_m - carrier.vertices_m
-    moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed))
+    moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed), links)
+    del links
     sigma = _sigma(carrier, weight, np.linalg.norm(onto - followed, axis=1), max(chosen.sigma_ct_m, spread), chosen)
     source = np.where(weight <= 0, Source.CT, np.where(weight >= 1, Source.SCAN, Source.BLEND)).astype(np.uint8)
     fused = Fused(

@@ -16,7 +16,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 Mask = NDArray[np.bool_]
-_POINTS = 20_000  # compared with faces at a time, which fits into the processor's cache
+_POINTS = 10_000  # compared with faces at a time, which fits into the processor's cache
 _FACES = 1_000_000  # whose connections are looked at together
 
 
