@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_cdt
 
 from service.compute.ground_truth.surface import IntArray
 from service.core.geometry import Array
@@ -118,9 +118,9 @@ class Block:
         for begin in range(0, len(points_m), _TOGETHER):
             part = points_m[begin : begin + _TOGETHER]
             empty[self._cells([part[:, k] for k in range(3)])] = False
-        cells = empty.reshape(tuple(self._size))
-        apart = self._cell * np.asarray(distance_transform_edt(cells), dtype=np.float64)  # of the cells' middles
-        self._apart = np.maximum(apart - np.sqrt(3.0) * self._cell, 0.0).ravel()
+        # Cells that are n apart along one of the axes have at least n - 1 between them.
+        apart = np.asarray(distance_transform_cdt(empty.reshape(tuple(self._size)), metric="chessboard"))
+        self._apart = self._cell * np.maximum(apart.ravel() - 1.0, 0.0)
 
     def _cells(self, inside: Sequence[Array]) -> IntArray:
         """(N,) the number of the cell of each place, given by its three coordinates (N,)."""
