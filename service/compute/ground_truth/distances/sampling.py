@@ -9,7 +9,7 @@ from itertools import islice
 
 import numpy as np
 
-from service.compute.ground_truth.distances.neighbours import spatial_order
+from service.compute.ground_truth.distances.neighbours import z_order
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -89,13 +89,16 @@ class BlockedSamples:
 
         In a file whose faces have no spatial order, each block is spread over the whole surface.
         """
-        order = spatial_order(self._surface.vertices_m[self._surface.faces[:, 0]]) if self._surface.is_mesh else None
-        if order is None:
+        runs = -(-self.n // (_TOGETHER * _BLOCK))
+        places = self._surface.vertices_m[self._surface.faces[:, 0]] if self._surface.is_mesh and runs > 1 else None
+        if places is None or not _overlap(places, runs):
             blocks = self.blocks()
             while some := list(islice(blocks, _TOGETHER)):
                 points_m, origin = _joined(some)
                 yield Samples(points_m, origin, None)
             return
+        order = z_order(places)
+        del places
         count = np.diff(self._upto, prepend=0)
         first = np.empty_like(count)  # samples that come before those of a face in this order
         first[order] = np.cumsum(count[order]) - count[order]
@@ -109,6 +112,14 @@ class BlockedSamples:
             points_m, origin = _joined(list(self.blocks(chosen)))
             near = np.argsort(first[origin])
             yield Samples(points_m[near], origin[near], None)
+
+
+def _overlap(places: Array, runs: int) -> bool:
+    """Whether boxes around so many runs of consecutive places (N, 3) overlap as those of an order in space do not."""
+    whole = np.ptp(places, axis=0)
+    thickness = 0.01 * float(whole.max())  # at least; a plane has none
+    boxes = [np.prod(np.ptp(run, axis=0) + thickness) for run in np.array_split(places, runs)]
+    return float(np.sum(boxes)) > 2 * float(np.prod(whole + thickness))
 
 
 def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
