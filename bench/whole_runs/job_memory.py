@@ -1,6 +1,10 @@
 """Peak memory and time of the jobs that compute on surfaces, at the size of the paper's protocol.
 
 Run: python -m bench.whole_runs.job_memory [--limit-gb 1.5] [--voxel-mm 0.4] [--spacing-mm 0.5] [--jobs fuse …]
+     [--before CHECKOUT --rounds 3]
+
+With `--before` each job is computed in turn by the program of another checkout and by this one, and their medians,
+the ratio of them and whether both gave the same files are reported.
 
 Each job is computed in a process of its own, under a hard limit of its memory (RLIMIT_DATA: all that it allocates,
 without the pages of mapped files) and with the allocator set as a worker sets it. The volume is that of the whole
@@ -12,6 +16,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -21,6 +26,7 @@ import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -146,6 +152,7 @@ def compute(folder: Path, name: str, limit_gb: float) -> dict[str, Any]:
         "peak_mb": round(used.ru_maxrss / 1e3),
         "seconds": round(took_s, 1),
         "cpu_s": round(used.ru_utime + used.ru_stime, 1),
+        "of_the_system_s": round(used.ru_stime, 1),
         "measures": {key: round(value, 5) for key, value in answer.measures.items()},
     }
 
@@ -153,6 +160,42 @@ def compute(folder: Path, name: str, limit_gb: float) -> dict[str, Any]:
 def _status_kb(name: str) -> int:
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+
+
+def alone(name: str, options: argparse.Namespace, checkout: Path = REPOSITORY) -> dict[str, Any]:
+    """Compute a job in a process of its own, by the program of a checkout; what it took, or how it failed."""
+    command = [sys.executable, "-m", "bench.whole_runs.job_memory", "--alone", name,
+               "--limit-gb", str(options.limit_gb), "--cache", str(options.cache.absolute())]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
+    lines = done.stdout.splitlines()
+    found = json.loads(lines[-1]) if done.returncode == 0 else {"job": name, "failed": done.stderr[-500:]}
+    print(json.dumps(found), flush=True)
+    return found
+
+
+def compared(name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Compute a job by both checkouts in turn; the medians of each, their ratios, and which files were the same."""
+    rounds: dict[str, list[dict[str, Any]]] = {"before": [], "after": []}
+    files: dict[str, dict[str, str]] = {"before": {}, "after": {}}
+    for _ in range(options.rounds):
+        for which, checkout in (("before", options.before.absolute()), ("after", REPOSITORY)):
+            began_s = time.time()
+            rounds[which].append(alone(name, options, checkout))
+            made = (path for path in options.cache.iterdir() if path.is_file() and path.stat().st_mtime >= began_s)
+            files[which] |= {path.name: hash_file(path)[0] for path in made}
+    failed = [one["failed"] for of in rounds.values() for one in of if "failed" in one]
+    if failed:
+        return {"job": name, "failed": failed[0], "rounds": rounds}
+    figures = ("cpu_s", "of_the_system_s", "seconds", "peak_mb")
+    medians = {
+        which: {key: median(one[key] for one in of if key in one) for key in figures if key in of[0]}
+        for which, of in rounds.items()
+    }
+    ratios = {key: round(medians["after"][key] / value, 3) for key, value in medians["before"].items()}
+    same = sorted(name for name in files["after"] if files["after"][name] == files["before"].get(name))
+    others = sorted(set(files["after"]) - set(same))
+    return {"job": name, "medians": medians, "ratios": ratios, "same": same, "others": others, "rounds": rounds}
 
 
 def main() -> int:
@@ -165,6 +208,8 @@ def main() -> int:
     parser.add_argument("--spacing-mm", type=float, default=0.5)
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--name", default="job_memory")
+    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="compare with the program of this checkout")
+    parser.add_argument("--rounds", type=int, default=3, help="of a comparison")
     parser.add_argument("--alone", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.alone:
@@ -172,17 +217,12 @@ def main() -> int:
         return 0
     make_inputs(options.cache, metres(options.voxel_mm), metres(options.spacing_mm))
     inputs = json.loads((options.cache / "inputs.json").read_bytes())
-    found: list[dict[str, Any]] = []
-    for name in options.jobs:
-        command = [sys.executable, "-m", "bench.whole_runs.job_memory", "--alone", name,
-                   "--limit-gb", str(options.limit_gb), "--cache", str(options.cache)]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        lines = done.stdout.splitlines()
-        found.append(json.loads(lines[-1]) if done.returncode == 0 else {"job": name, "failed": done.stderr[-500:]})
-        print(json.dumps(found[-1]), flush=True)
+    run = alone if options.before is None else compared
+    found = [run(name, options) for name in options.jobs]
     record = {
         "machine": machine(),
         "commit": commit(),
+        "load": [round(load, 1) for load in os.getloadavg()],
         "voxel_mm": options.voxel_mm,
         "scan_spacing_mm": options.spacing_mm,
         "voxels": inputs["voxels"],

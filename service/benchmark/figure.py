@@ -79,7 +79,7 @@ def _line(words: str, width: int) -> NDArray[np.uint8]:
 
 def _panel(out: Path, result: BenchmarkResult | None, title: str, index: PointIndex, scale: HeatScale) -> Panel:
     if result is None or result.score is None:
-        return Panel(np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8), None, f"{title}: -")
+        return Panel(np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8), lambda _: None, f"{title}: -")
     surface = _surface(out / f"{result.method}-{result.scenario}" / "mesh.ply")
     samples = sample(surface, SPACING_M, np.random.default_rng(0))
     compared = DistanceSamples(samples, index.nearest(samples.points_m)[0])

@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _LARGEST_KEPT = 32 << 20  # the largest value that glibc accepts
 _MOST_KEPT = 1 << 30
-_RETURNED, _USUALLY_KEPT = 1 << 20, 128 << 10  # glibc's own limit for what it keeps
+_RETURNED = 1 << 20
+# Of what is smaller: the arrays of the next block of faces need no cleared pages. With glibc's own 128 kB, more than
+# half of the time went into these.
+_SMALLER_KEPT = 32 << 20
 
 
 def keep_freed_memory() -> None:
@@ -41,7 +44,7 @@ def large_arrays_returned() -> Generator[None]:
     with suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(_M_MMAP_THRESHOLD, _RETURNED)
-        libc.mallopt(_M_TRIM_THRESHOLD, _USUALLY_KEPT)
+        libc.mallopt(_M_TRIM_THRESHOLD, _SMALLER_KEPT)
     try:
         yield
     finally:

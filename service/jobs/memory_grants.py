@@ -2,7 +2,8 @@
 
 A job begins when it fits beside what runs. What was granted and is not used yet counts as used. One that waits for
 others of these jobs to end is overtaken by none that came later, so that many small jobs cannot keep a large one
-waiting for ever. One that waits for other programs to give memory back holds up nobody.
+waiting for ever. One that waits for other programs to give memory back holds up nobody, and does so for ten minutes:
+then a person is asked, since no job of ours will end and make room for it.
 """
 
 from __future__ import annotations
@@ -58,11 +59,13 @@ class MemoryGrants:
         data: the data folder.
         clock: of the worker.
         memory: of the machine.
+        patience_s: for how long a job waits for other programs alone.
     """
 
     data: Path
     clock: Clock
     memory: Callable[[], MachineMemory] = machine_memory
+    patience_s: float = 600.0
 
     @contextmanager
     def granted(self, job: str, memory_mb: float, tell: Callable[[str], None]) -> Generator[None]:
@@ -74,7 +77,7 @@ class MemoryGrants:
             tell: called with why it waits, whenever that changes.
 
         Raises:
-            ComputeError: the machine does not have that much.
+            ComputeError: the machine does not have that much, or other programs have kept it for long.
         """
         whole = self.memory()
         if memory_mb > whole.total_mb - _RESERVE_MB:
@@ -93,12 +96,20 @@ class MemoryGrants:
             job=job,
             memory_mb=memory_mb,
         )
-        told = ""
+        told, since_s = "", self.clock.monotonic_s()
         try:
             while (grant := self._take(own, grant)).waits:
                 if grant.waits != told:
                     tell(grant.waits)
                     told = grant.waits
+                if any(not other.waits for other in _grants(self.data)):
+                    since_s = self.clock.monotonic_s()  # that one will end
+                elif self.clock.monotonic_s() - since_s > self.patience_s:
+                    raise ComputeError(
+                        f"the job has waited {self.patience_s:.0f} s for memory that no computation uses: it "
+                        f"{grant.waits}",
+                        remedy="End other programs, or give this machine more memory; then try again",
+                    )
                 self.clock.sleep(_POLL_S)
             yield
         finally:

@@ -168,6 +168,8 @@ def test_act_records_what_is_allowed_and_what_was_refused(tmp_path: Path) -> Non
     assert invoke("act", "redo", "--run", run, "--data", data, "--json", "--reason", "why not").exit_code == 1
     accepted = invoke("act", "confirm", "--run", run, "--data", data, "--operator", "Grace", "--json")
     assert answer_of(accepted) == {"run": run, "recorded": "confirm", "step": "fixation"}
+    unsaid = invoke("act", "abort", "--data", data, "--operator", "Grace")
+    assert (unsaid.exit_code, "needs a reason" in unsaid.output) == (1, True)
     assert invoke("act", "abort", "--data", data, "--reason", "done for today").exit_code == 0
     with Store.open(data) as store:
         events = store.events(run)

@@ -16,6 +16,7 @@ from service.core.records.events import (
     StepRetried,
     StepStarted,
 )
+from service.core.run.actions import refuse
 from service.core.run.decide import (
     Accept,
     Halt,
@@ -84,6 +85,18 @@ def test_pause_holds_everything_but_work_in_flight() -> None:
     assert log.decision == RunStep("capture", 1, begin=False)
     assert set(log.state.step.captured) == {"a"}
     refused(log, "not paused", action="resume")
+
+
+def test_who_ends_a_run_says_why_and_one_that_was_once_ended_without_still_is() -> None:
+    log = at_capture()
+    for reason in ("", "  "):
+        refusal = refuse(log.protocol, log.state, OperatorAction(action="abort", reason=reason), "Ada")
+        assert refusal is not None
+        assert "abort needs a reason" in str(refusal)
+    log.act("abort")  # as recorded by an earlier version
+    assert log.decision == Halt("aborted")
+    assert log.state.stop_reason == "aborted by Ada"
+    assert not log.state.deviations
 
 
 def test_abort_ends_the_run_and_late_records_are_kept_without_effect() -> None:

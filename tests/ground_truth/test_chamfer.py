@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
+from service.compute.ground_truth.distances import chamfer as compared
+from service.compute.ground_truth.distances import sampling
 from service.compute.ground_truth.distances.chamfer import ChamferSettings, chamfer
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import sample
@@ -126,6 +128,49 @@ def test_the_score_is_that_of_brute_force_over_the_same_samples() -> None:
     assert score.pred_to_gt.excluded == int(np.sum(forth > 0.006)) > 0
     p, r = float(np.mean(forth <= 1e-3)), float(np.mean(back <= 1e-3))
     assert score.f_scores[1] == pytest.approx(2 * p * r / (p + r))
+
+
+def shuffled(of: Surface) -> Surface:
+    return Surface(of.vertices_m, np.random.default_rng(7).permutation(of.faces))
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_of_many_samples_some_are_compared_with_all_in_whatever_order_the_faces_are(
+    monkeypatch: pytest.MonkeyPatch, ordered: bool
+) -> None:
+    monkeypatch.setattr(sampling, "_BLOCK", 300)
+    monkeypatch.setattr(compared, "MOST_COMPARED", 1000)
+    pred, gt = shifted(plane(cells=60), (0.002, 0.0005, -0.0003)), plane(cells=50)
+    if not ordered:
+        pred, gt = shuffled(pred), shuffled(gt)
+    chosen, rng = ChamferSettings(spacing_m=1.8e-4), np.random.default_rng(0)
+    a, b = sample(pred, chosen.spacing_m, rng), sample(gt, chosen.spacing_m, rng)
+    score = chamfer(pred, gt, chosen)
+    for way, of, all_of_other in ((score.pred, a, b), (score.gt, b, a)):
+        assert 900 < len(way.samples.points_m) <= 1000 < len(of.points_m) / 2
+        number = cdist(way.samples.points_m, of.points_m).argmin(axis=1)
+        assert np.array_equal(of.points_m[number], way.samples.points_m)
+        assert np.array_equal(of.origin[number], way.samples.origin)
+        assert len(np.unique(number)) == len(number)
+        nearest = cdist(way.samples.points_m, all_of_other.points_m).min(axis=1)
+        assert way.distance_m == pytest.approx(nearest, rel=1e-12)
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_regions_hold_each_sample_once_and_those_together_that_lie_together(
+    monkeypatch: pytest.MonkeyPatch, ordered: bool
+) -> None:
+    monkeypatch.setattr(sampling, "_BLOCK", 100)
+    of = plane(cells=60) if ordered else shuffled(plane(cells=60))
+    whole = sample(of, 2e-4, np.random.default_rng(3))
+    regions = list(sampling.BlockedSamples(of, 2e-4, np.random.default_rng(3)).regions())
+    assert [len(region.origin) for region in regions] == 6 * [400]
+    points, origin = (
+        np.concatenate([getattr(region, name) for region in regions]) for name in ("points_m", "origin")
+    )
+    assert np.array_equal(np.sort(origin), whole.origin)
+    assert np.array_equal(points[np.lexsort(points.T)], whole.points_m[np.lexsort(whole.points_m.T)])
+    assert np.mean([np.prod(np.ptp(region.points_m[:, :2], axis=0)) for region in regions]) < 0.5 * 0.012 * 0.008
 
 
 @given(seed=st.integers(0, 1000), n=st.integers(1, 60), spread=st.floats(0.001, 0.1))

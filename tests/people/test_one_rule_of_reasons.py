@@ -29,8 +29,8 @@ def run(office: Office, tmp_path: Path) -> str:
     return run_id
 
 
-def _act(store: Store, run: str, reason: str) -> None:
-    words = ["act", "skip", "--reason", reason, "--operator", "grace", "--password-stdin"]
+def _act(store: Store, run: str, verb: str, reason: str) -> None:
+    words = ["act", verb, "--reason", reason, "--operator", "grace", "--password-stdin"]
     data = str(store.database_path.parent)
     done = CliRunner().invoke(app, [*words, "--run", run, "--data", data], input="correct horse grace\n")
     if done.exit_code:
@@ -46,7 +46,8 @@ PLACES: dict[str, Callable[[Office, str, str], object]] = {
     ),
     "account": lambda office, _run, reason: office.people.accounts.disable(office.enter("ada")[1], "grace", reason),
     "control": lambda office, run, reason: Control(office.store).take_over(run, office.enter("emmy")[1], reason),
-    "act": lambda office, run, reason: _act(office.store, run, reason),
+    "skip": lambda office, run, reason: _act(office.store, run, "skip", reason),
+    "end": lambda office, run, reason: _act(office.store, run, "abort", reason),
 }
 
 

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from service.compute.machine_memory import MachineMemory, machine_memory, processes_for
-from service.core.errors import IllegalTransitionError
+from service.core.errors import ComputeError, IllegalTransitionError
 from service.core.records.events import JobFailed
 from service.jobs import job_kinds
 from service.jobs.kind import Demand
@@ -160,6 +160,36 @@ def test_a_job_that_waits_for_other_programs_holds_up_no_other(store: Store, clo
     grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, 2000))  # of no job of ours is the rest
     with grants.granted("small", 200, pytest.fail):
         assert waiting_for_memory(data) == {"large": "waits for memory"}
+
+
+def test_a_job_for_which_other_programs_leave_no_room_asks_in_the_end(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, 1000), patience_s=20)
+    told: list[str] = []
+    began_s = clock.monotonic_s()
+    with (
+        pytest.raises(ComputeError, match="has waited 20 s for memory that no computation uses: it waits for"),
+        grants.granted("mine", 3000, told.append),
+    ):
+        pytest.fail("it has begun")
+    assert 20 < clock.monotonic_s() - began_s < 22
+    assert len(told) == 1
+    assert waiting_for_memory(data) == {}
+
+
+def test_a_job_waits_for_those_of_other_workers_however_long_they_take(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    theirs = write_grant(data / "monitor" / "memory", os.getppid(), "theirs", 5000)
+    began_s = clock.monotonic_s()
+
+    def memory() -> MachineMemory:
+        if clock.monotonic_s() - began_s < 25:
+            return MachineMemory(8000, 2000)
+        theirs.unlink(missing_ok=True)
+        return MachineMemory(8000, 7000)
+
+    with MemoryGrants(data, clock, memory, patience_s=20).granted("mine", 3000, lambda _why: None):
+        assert clock.monotonic_s() - began_s >= 25
 
 
 def test_those_that_wait_keep_the_order_in_which_they_came(store: Store, clock: SteppedClock) -> None:

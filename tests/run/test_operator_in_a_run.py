@@ -183,6 +183,24 @@ def test_skip_needs_the_protocols_leave_and_a_reason(bench: Bench) -> None:
     assert bench.captured() == VIEWS
 
 
+def test_a_run_is_not_ended_by_somebody_who_does_not_say_why(bench: Bench) -> None:
+    bench.script("fixation", "confirm", say("abort"), say("abort", reason="the specimen fell"))
+    state = bench.run()
+    assert (state.status, state.stop_reason) == ("aborted", "the specimen fell")
+    (refused,) = bench.payloads(ActionRefused)
+    assert "abort needs a reason" in refused.why
+    assert any("abort needs a reason" in line for line in bench.operator.told)
+    bench.must_verify()
+
+
+def test_a_record_of_a_version_in_which_nobody_had_to_say_why_ends_its_run(bench: Bench) -> None:
+    bench.rig.arm.on_move = lambda move: bench.act("abort") if move == 2 else None
+    state = bench.run()
+    assert (state.status, state.stop_reason) == ("aborted", "aborted by Grace")
+    assert bench.captured() == VIEWS[:1]
+    bench.must_verify()
+
+
 def test_a_confirmation_without_all_ticks_is_refused_and_recorded(bench: Bench) -> None:
     bench.script("fixation", "confirm", say("confirm", checklist=("wires hold",)))
     assert bench.run().status == "completed"

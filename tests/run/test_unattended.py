@@ -15,8 +15,9 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import AutomaticOperator, Display, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import PersonNeededError
-from service.core.records.events import StepFailed
+from service.core.records.events import OperatorAction, StepFailed
 from service.core.run.decide import AskOperator
+from service.core.text.reasons import REASON_CHARACTERS
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.store.store import Store
@@ -128,3 +129,16 @@ def test_a_terminal_that_was_closed_has_it_too(display: Display) -> None:
     with pytest.raises(PersonNeededError, match="the terminal was closed"):
         operator.poll(log.question, log.state)
     os.close(reading)
+
+
+def test_what_is_typed_as_a_reason_has_the_same_limits_as_everywhere(display: Display) -> None:
+    log = Log(toy_protocol())
+    reading, writing = os.pipe()
+    operator = TerminalOperator("Ada", log.protocol, display, SimulatedHands(None), descriptor=reading)
+    os.write(writing, b"abort " + (REASON_CHARACTERS + 1) * b"x" + b"\n" + b"abort it fell\n")
+    assert operator.poll(log.question, log.state) is None, "it asks again"
+    answer = operator.poll(log.question, log.state)
+    assert isinstance(answer, OperatorAction)
+    assert (answer.action, answer.reason) == ("abort", "it fell")
+    os.close(reading)
+    os.close(writing)

@@ -188,6 +188,18 @@ def test_dialogs_open_without_script(web: WebSite, run_id: str) -> None:
     assert not re.search(r'<dialog id="dialog-abort"[^>]* open>', browser.get(f"/runs/{run_id}").text)
 
 
+def test_ending_a_run_demands_a_reason_of_whatever_sends_the_form(web: WebSite, run_id: str) -> None:
+    browser = web.browser("technician")
+    web.take_control(run_id, browser)
+    for reason in ("", " \n"):
+        refused = browser.send_form(f"/runs/{run_id}/actions", verb="abort", reason=reason)
+        assert refused.status_code == 409
+        assert "needs a reason" in refused.text
+    assert not web.site.run(run_id).state.terminal
+    assert browser.send_form(f"/runs/{run_id}/actions", verb="abort", reason="it fell").status_code == 303
+    assert web.site.run(run_id).state.stop_reason == "it fell"
+
+
 def test_a_stop_is_told_at_once_and_with_what_to_do(web: WebSite, run_id: str) -> None:
     tell(web, run_id, doing="asking", robot="emergency_stop", messages=(Message(at_utc="", text="stopped"),))
     banner = web.browser("auditor").get(f"/runs/{run_id}/parts/banner").text

@@ -52,7 +52,7 @@ def act_command(
     run: RunOption = "latest",
     step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
     viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo only this viewpoint.")] = None,
-    reason: Annotated[str, typer.Option("--reason", help="Why; required for redo, skip and accept.")] = "",
+    reason: Annotated[str, typer.Option("--reason", help="Why; required for redo, skip, accept and abort.")] = "",
     meaning: Annotated[str, typer.Option("--meaning", help="What the signature means.")] = "",
     item: Annotated[str, typer.Option("--item", help="The item to tick or untick, or how it begins.")] = "",
     device: Annotated[str, typer.Option("--device", help="The arm that you have looked at.")] = "",

@@ -15,8 +15,19 @@ Refusal = IllegalTransitionError
 VERBS: tuple[OperatorVerb, ...] = ("confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort")
 
 
-def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
-    """The reason to refuse an action, or None."""
+def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:
+    """The reason to refuse an action that a person asks for now, or None."""
+    refusal = recorded_refusal(protocol, state, action, actor)
+    if refusal is None and action.action == "abort":
+        return _reason_refusal(action, state.current)
+    return refusal
+
+
+def recorded_refusal(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
+    """The reason why a recorded action had no effect, or None.
+
+    A run could once be ended without a reason: such a record still ends its run.
+    """
     if not state.started:
         return Refusal("the run has not started", where=action.action)
     if state.terminal:

@@ -8,7 +8,7 @@ from typing import Any
 from service.core.gates.acceptance import describe_accepted, failed_gates
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorAction
-from service.core.run.actions import refuse
+from service.core.run.actions import recorded_refusal
 from service.core.run.effects.arms import all_seen
 from service.core.run.lifecycle import redo
 from service.core.run.state import AcceptedDeviation, DeviationKind, Leave, RunState, StepState
@@ -17,7 +17,7 @@ from service.core.run.state_transitions import UNMEASURED, change, deviate, go, 
 
 def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return per verb
     """The state after an action; an action that is not allowed is listed as refused and has no other effect."""
-    refusal = refuse(protocol, state, p, event.actor)
+    refusal = recorded_refusal(protocol, state, p, event.actor)
     if refusal is not None:
         return deviate(state, event, "refused", p.step, f"{p.action} had no effect: {refusal}")
     state = replace(state, people=state.people | {event.actor})

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from service.store.durable_effects import Files
 from service.store.journal.journal import Tail, read_tail
 from service.store.journal.lines import NAME
 from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.log import copying_alone
 from service.store.verification.chain_checks import Fault
 
 _BLOCK_BYTES = 1 << 22
@@ -41,21 +40,18 @@ class JournalCopy:
             IntegrityError: the copy is not a beginning of the journal: one of them was changed.
             StoreError: the copy cannot be written; the next call adds what is missing.
         """
-        try:
-            descriptor = os.open(self._journal.with_name(LOG_NAME), os.O_RDONLY | os.O_CLOEXEC)
-        except FileNotFoundError:
-            return  # nothing was signed yet
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            self._append()
-        except OSError as error:
-            raise StoreError(
-                f"the copy of the journal cannot be written: {error.strerror or error}",
-                where=str(self.copy),
-                remedy="Check that the share or the medium is there and that it has space",
-            ) from error
-        finally:
-            os.close(descriptor)
+        log = self._journal.with_name(LOG_NAME)
+        with copying_alone(log):
+            if not log.exists():
+                return  # nothing was signed yet
+            try:
+                self._append()
+            except OSError as error:
+                raise StoreError(
+                    f"the copy of the journal cannot be written: {error.strerror or error}",
+                    where=str(self.copy),
+                    remedy="Check that the share or the medium is there and that it has space",
+                ) from error
 
     def _append(self) -> None:
         end, held = read_tail(self._journal), read_tail(self.copy)

@@ -25,6 +25,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from service.core.errors import StoreError
 from service.core.records.events import SignaturesWrittenAgain
+from service.store.database.engine import LOOK
 from service.store.durable_effects import Files
 from service.store.events import canonical_parsed
 from service.store.records import SITE, Checkpoint
@@ -176,6 +177,32 @@ def power_cut_explains(missing: Sequence[Checkpoint], newest: int) -> bool:
     return len(missing) <= _MOST_AT_ONCE and all(item.site_seq >= newest for item in missing)
 
 
+@contextmanager
+def copying_alone(log: Path) -> Generator[None]:
+    """Wait until no other process writes to the second place of this log, and keep them waiting.
+
+    Signatures do not wait for it: they are kept apart by the folder (SignatureLog.alone). Before the first signature
+    there is nothing to wait for. Raises StoreError if the log cannot be read.
+    """
+    try:
+        descriptor = os.open(log, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        yield
+        return
+    except OSError as error:
+        raise unread(log, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def unread(path: Path, error: OSError) -> StoreError:
+    """The error of a log of signatures, or of a copy of it, that cannot be read."""
+    return StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK)
+
+
 def _unwritten(path: Path, error: OSError) -> StoreError:
     return StoreError(
         f"the log of signatures cannot be written: {error.strerror or error}",
@@ -199,11 +226,7 @@ def _content(path: Path, offset: int) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise StoreError(
-            f"the log of signatures cannot be read: {error.strerror}",
-            where=str(path),
-            remedy="Check the permissions of the data folder",
-        ) from error
+        raise unread(path, error) from error
 
 
 def _parsed(content: bytes, end: LogEnd) -> Iterator[tuple[LogLine, LogEnd]]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
-from service.store.database.engine import LOOK
 from service.store.durable_effects import DurableFiles, Files
 from service.store.journal.copies import journal_copy, journal_copy_faults
-from service.store.signatures.log import NAME
+from service.store.signatures.log import NAME, copying_alone, unread
 from service.store.verification.chain_checks import Fault
 
 _FILES = DurableFiles()
@@ -36,18 +34,8 @@ class LogCopy:
             IntegrityError: the copy is not a beginning of the source: one of them was changed.
             StoreError: the copy cannot be written; the next call will add what is missing.
         """
-        try:
-            descriptor = os.open(self.source, os.O_RDONLY | os.O_CLOEXEC)
-        except FileNotFoundError:
-            self._update()  # nothing was signed yet
-            return
-        except OSError as error:
-            raise _unread(self.source, error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)  # one process writes to the copy at a time
+        with copying_alone(self.source):
             self._update()
-        finally:
-            os.close(descriptor)
 
     def _update(self) -> None:
         start = self._same - len(self._last)
@@ -117,8 +105,4 @@ def _bytes(path: Path, offset: int = 0) -> bytes:
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise _unread(path, error) from error
-
-
-def _unread(path: Path, error: OSError) -> StoreError:
-    return StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK)
+        raise unread(path, error) from error

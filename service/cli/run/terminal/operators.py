@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
-from service.core.errors import PersonNeededError
+from service.core.errors import ConfigurationError, PersonNeededError
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import Protocol
@@ -21,6 +21,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.core.shown_text import shown
+from service.core.text.reasons import reason_of
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for
@@ -246,6 +247,11 @@ class TerminalOperator(_Operator):
     def _action(self, question: AskOperator, state: RunState, verb: str, reason: str) -> OperatorAction | None:
         if verb not in question.options:
             self.display.tell(f"{verb!r} is not possible now; type one of: {', '.join(question.options)}")
+            return None
+        try:
+            reason = reason and reason_of(reason, ConfigurationError)
+        except ConfigurationError as error:
+            self.display.tell(str(error))
             return None
         if verb == "accept":
             if not reason:

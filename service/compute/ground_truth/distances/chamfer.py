@@ -151,15 +151,10 @@ def _compared(samples: BlockedSamples, seed: int) -> Samples:
     """The samples whose distances are measured: all, or MOST_COMPARED at random, the same share of each block."""
     rng = np.random.default_rng([seed, samples.n])  # of its own: the other draws do not depend on it
     share = min(1.0, MOST_COMPARED / samples.n)
-    kept: list[Samples] = []
-    for block in samples.blocks():
-        n = len(block.origin)
-        if share < 1:
-            some = np.sort(rng.choice(n, int(np.floor(share * n)), replace=False))
-            normals = None if block.normals is None else block.normals[some]
-            kept.append(Samples(block.points_m[some], block.origin[some], normals))
-        else:
-            kept.append(block)
+    some: list[IntArray] | None = None
+    if share < 1:
+        some = [np.sort(rng.choice(n, int(np.floor(share * n)), replace=False)) for n in samples.sizes]
+    kept = list(samples.blocks(some))
     all_normals = [block.normals for block in kept if block.normals is not None]
     return Samples(
         np.concatenate([block.points_m for block in kept]),
@@ -178,7 +173,7 @@ def _nearest(
     one, own, other = queries
     found = NearestOfBlocks(one, outlier_m), NearestOfBlocks(own), NearestOfBlocks(other, outlier_m)
     first = Samples(some.points_m[::_PREVIEW], some.origin[::_PREVIEW], None)
-    for block in chain([first] if targets.n > MOST_COMPARED else [], targets.blocks()):
+    for block in chain([first] if targets.n > MOST_COMPARED else [], targets.regions()):
         show(block.points_m, block.origin, found)
     return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.compute.ground_truth.distances.chamfer import ChamferScore, DistanceSamples
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import normals_at
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.geometry import Array
 from service.core.units import mm
 
@@ -55,18 +55,26 @@ class HeatScale:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Points of a surface to show: places (N, 3), red, green and blue (N, 3), normals (N, 3) or None; a title."""
+    """Points of a surface to show: places (N, 3), red, green and blue (N, 3); a title.
+
+    `normals` gives (K, 3) those of some of the points by their numbers, or None: most points are hidden by others.
+    """
 
     points_m: Array = field(repr=False)
     colours: Pixels = field(repr=False)
-    normals: Array | None = field(repr=False)
+    normals: Callable[[IntArray], Array | None] = field(repr=False)
     title: str
 
     @classmethod
     def of_distances(cls, surface: Surface, compared: DistanceSamples, scale: HeatScale, title: str) -> Panel:
         """The samples of a surface in the colours of their distances."""
         samples = compared.samples
-        return cls(samples.points_m, scale.colours(compared.distance_m), normals_at(surface, samples.origin), title)
+        colours = scale.colours(compared.distance_m)
+        return cls(samples.points_m, colours, lambda some: normals_at(surface, samples.origin[some]), title)
+
+    def part(self, chosen: IntArray) -> Panel:
+        """Some of its points (K,)."""
+        return Panel(self.points_m[chosen], self.colours[chosen], lambda some: self.normals(chosen[some]), self.title)
 
 
 def heat_picture(
@@ -133,9 +141,7 @@ def heat_row(panels: Sequence[Panel], gt: Surface, gt_points_m: Array, panel_px:
         inside = np.flatnonzero(((at >= 0) & (at < np.array([shape[1], shape[0]]))).all(axis=1))
         image = np.full((*shape, 3), _PAPER, dtype=np.uint8)
         if len(inside):
-            normals = None if panel.normals is None else panel.normals[inside]
-            kept = Panel(panel.points_m[inside], panel.colours[inside], normals, panel.title)
-            image = _splat(kept, seen[inside], pixel_m, shape, axes[2])
+            image = _splat(panel.part(inside), seen[inside], pixel_m, shape, axes[2])
         gap = np.full((shape[0] + _TEXT_PX, _MARGIN_PX, 3), _PAPER, dtype=np.uint8)
         drawn += [gap, _captioned(image, panel.title)]
     return np.hstack(drawn)
@@ -161,27 +167,33 @@ def _splat(panel: Panel, seen: Array, pixel_m: float, shape: tuple[int, int], aw
     """The points of one surface as pixels, the nearest to the viewer on top, without paper between neighbours."""
     at = (seen[:, :2] / pixel_m).astype(np.int64)
     order = np.argsort(-seen[:, 2])
+    nearest_of = np.full(shape, -1, dtype=np.int64)
+    nearest_of[at[order, 1], at[order, 0]] = order
+    y, x = np.nonzero(nearest_of >= 0)
+    nearest = nearest_of[y, x]
     depth = np.full(shape, np.inf, dtype=np.float32)
-    depth[at[order, 1], at[order, 0]] = seen[order, 2]
-    gap = _gap_px(seen, pixel_m, int(np.count_nonzero(np.isfinite(depth))))
+    depth[y, x] = seen[nearest, 2]
+    gap = _gap_px(seen, pixel_m, len(nearest))
     # What lies behind shows between the points; it is far behind the nearest point around it.
     around = 2 * max(2, gap) + 1
     front = cv2.erode(depth, np.ones((around, around), np.uint8))
     behind_m = _BEHIND * around * pixel_m
-    order = order[seen[order, 2] <= front[at[order, 1], at[order, 0]] + behind_m]
-    colours = panel.colours[order].astype(np.float64)
-    if panel.normals is not None:
-        colours *= (0.55 + 0.45 * np.abs(panel.normals[order] @ away))[:, None]
+    visible = seen[nearest, 2] <= front[y, x] + behind_m
+    y, x, shown = y[visible], x[visible], nearest[visible]
+    colours = panel.colours[shown].astype(np.float64)
+    normals = panel.normals(shown)
+    if normals is not None:
+        colours *= (0.55 + 0.45 * np.abs(normals @ away))[:, None]
     image = np.full((*shape, 3), _PAPER, dtype=np.uint8)
-    image[at[order, 1], at[order, 0]] = colours[:, ::-1].astype(np.uint8)
+    image[y, x] = colours[:, ::-1].astype(np.uint8)
     empty = np.ones(shape, dtype=np.uint8)
-    empty[at[order, 1], at[order, 0]] = 0
+    empty[y, x] = 0
     found = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    away_px, nearest = np.asarray(found[0], dtype=np.float32), np.asarray(found[1], dtype=np.int64)
-    of_label = np.zeros((int(nearest.max()) + 1, 3), dtype=np.uint8)
-    of_label[nearest[empty == 0]] = image[empty == 0]
+    away_px, label = np.asarray(found[0], dtype=np.float32), np.asarray(found[1], dtype=np.int64)
+    of_label = np.zeros((int(label.max()) + 1, 3), dtype=np.uint8)
+    of_label[label[empty == 0]] = image[empty == 0]
     filled = (empty == 1) & (away_px < gap + 0.5)
-    image[filled] = of_label[nearest[filled]]
+    image[filled] = of_label[label[filled]]
     return image
 
 

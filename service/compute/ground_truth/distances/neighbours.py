@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_cdt
 
 from service.compute.ground_truth.surface import IntArray
 from service.core.geometry import Array
@@ -21,6 +21,7 @@ _PROBE = 4096  # consecutive points that are looked at to tell whether their ord
 _NEAR = 0.02  # of the extent: a usual step between consecutive points in spatial order is shorter
 _CELLS = 128  # along the longest side of a block of points, in the grid that says how far it is
 _GROUP = 4096  # queries that lie together
+_TOGETHER = 25_000  # points whose cells are found at a time, which fits into the processor's cache
 
 
 class PointIndex:
@@ -113,21 +114,27 @@ class Block:
         self._low, self._high = points_m.min(axis=0), points_m.max(axis=0)
         self._cell = max(float(np.max(self._high - self._low)) / _CELLS, 1e-300)
         self._size = np.floor((self._high - self._low) / self._cell).astype(np.int64) + 1
-        empty = np.ones(tuple(self._size), dtype=np.bool_)
-        for begin in range(0, len(points_m), _CHUNK // 10):
-            empty[self._cells(points_m[begin : begin + _CHUNK // 10])] = False
-        apart = self._cell * np.asarray(distance_transform_edt(empty), dtype=np.float64)  # of the cells' middles
-        self._apart = np.maximum(apart - np.sqrt(3.0) * self._cell, 0.0)
+        empty = np.ones(int(np.prod(self._size)), dtype=np.bool_)
+        for begin in range(0, len(points_m), _TOGETHER):
+            part = points_m[begin : begin + _TOGETHER]
+            empty[self._cells([part[:, k] for k in range(3)])] = False
+        # Cells that are n apart along one of the axes have at least n - 1 between them.
+        apart = np.asarray(distance_transform_cdt(empty.reshape(tuple(self._size)), metric="chessboard"))
+        self._apart = self._cell * np.maximum(apart.ravel() - 1.0, 0.0)
 
-    def _cells(self, points_m: Array) -> tuple[IntArray, ...]:
-        return tuple(np.minimum((points_m - self._low) / self._cell, self._size - 1).astype(np.int64).T)
+    def _cells(self, inside: Sequence[Array]) -> IntArray:
+        """(N,) the number of the cell of each place, given by its three coordinates (N,)."""
+        number = np.zeros(len(inside[0]), dtype=np.int64)
+        for x, low, size in zip(inside, self._low, self._size, strict=True):
+            number = number * size + np.minimum((x - low) / self._cell, size - 1).astype(np.int64)
+        return number
 
     def least_distance(self, places_m: Array) -> Array:
         """(Q,) a distance than which no point of the block is nearer to a place (Q, 3)."""
-        inside = np.clip(places_m, self._low, self._high)
+        inside = [np.clip(places_m[:, k], self._low[k], self._high[k]) for k in range(3)]
         # The box is convex: the way to a point in it is at least as long as both legs of a right angle.
-        legs = np.linalg.norm(places_m - inside, axis=1), self._apart[self._cells(inside)]
-        return np.hypot(*legs) * (1 - 1e-9)
+        beside = sum(((places_m[:, k] - inside[k]) ** 2 for k in range(3)), self._apart[self._cells(inside)] ** 2)
+        return np.sqrt(beside) * (1 - 1e-9)
 
 
 def spatial_order(points: Array) -> IntArray | None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
+from service.compute.ground_truth.distances.neighbours import z_order
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -15,7 +17,8 @@ from service.core.units import mm
 
 MOST_SAMPLES = 40_000_000  # of one surface; more are nearly always a mistaken unit
 _BLOCK = 1_000_000
-_PLACES = 50_000  # made at a time, which fits into the processor's cache
+_TOGETHER = 4  # blocks in a region
+_PLACES = 25_000  # made at a time, which fits into the processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +60,74 @@ class BlockedSamples:
             self._draws.append(copy.deepcopy(rng))
             rng.random((2, min(_BLOCK, self.n - begin), 1))  # those of the block, which is made later
 
-    def blocks(self) -> Iterator[Samples]:
-        """All samples in order, in blocks of up to a million; the same ones each time."""
-        for number, begin in enumerate(range(0, self.n, _BLOCK)):
-            end = min(begin + _BLOCK, self.n)
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many samples each block has."""
+        return tuple(min(_BLOCK, self.n - begin) for begin in range(0, self.n, _BLOCK))
+
+    def blocks(self, some: Sequence[IntArray] | None = None) -> Iterator[Samples]:
+        """All samples in order, in blocks of up to a million; the same ones each time.
+
+        `some` chooses from each block by their numbers in it (K,), in order; a block of which none is wanted is left
+        out.
+        """
+        for number, count in enumerate(self.sizes):
+            begin, chosen = number * _BLOCK, np.arange(count) if some is None else some[number]
+            if not len(chosen):
+                continue
             if not self._surface.is_mesh:
                 of = self._cloud
-                normals = None if of.normals is None else of.normals[begin:end]
-                yield Samples(of.points_m[begin:end], of.origin[begin:end], normals)
+                normals = None if of.normals is None else of.normals[begin + chosen]
+                yield Samples(of.points_m[begin + chosen], of.origin[begin + chosen], normals)
                 continue
-            origin = np.searchsorted(self._upto, np.arange(begin, end), side="right")
-            yield Samples(random_places(self._surface, origin, copy.deepcopy(self._draws[number])), origin, None)
+            origin = np.searchsorted(self._upto, begin + chosen, side="right")
+            drawn = copy.deepcopy(self._draws[number]).random((2, count))
+            yield Samples(_places(self._surface, origin, drawn if some is None else drawn[:, chosen]), origin, None)
+
+    def regions(self) -> Iterator[Samples]:
+        """All samples, those together that lie together, without normals; a region is larger than a block.
+
+        In a file whose faces have no spatial order, each block is spread over the whole surface.
+        """
+        runs = -(-self.n // (_TOGETHER * _BLOCK))
+        places = self._surface.vertices_m[self._surface.faces[:, 0]] if self._surface.is_mesh and runs > 1 else None
+        if places is None or not _overlap(places, runs):
+            blocks = self.blocks()
+            while some := list(islice(blocks, _TOGETHER)):
+                points_m, origin = _joined(some)
+                yield Samples(points_m, origin, None)
+            return
+        order = z_order(places)
+        del places
+        count = np.diff(self._upto, prepend=0)
+        first = np.empty_like(count)  # samples that come before those of a face in this order
+        first[order] = np.cumsum(count[order]) - count[order]
+        region = np.empty(self.n, dtype=np.uint16)
+        for begin in range(0, self.n, _BLOCK):
+            at = np.arange(begin, min(begin + _BLOCK, self.n))
+            of = np.searchsorted(self._upto, at, side="right")
+            region[at] = (first[of] + at - (self._upto[of] - count[of])) // (_TOGETHER * _BLOCK)
+        for number in range(int(region.max()) + 1):
+            chosen = [np.flatnonzero(region[begin : begin + _BLOCK] == number) for begin in range(0, self.n, _BLOCK)]
+            points_m, origin = _joined(list(self.blocks(chosen)))
+            near = np.argsort(first[origin])
+            yield Samples(points_m[near], origin[near], None)
+
+
+def _overlap(places: Array, runs: int) -> bool:
+    """Whether boxes around so many runs of consecutive places (N, 3) overlap as those of an order in space do not."""
+    whole = np.ptp(places, axis=0)
+    thickness = 0.01 * float(whole.max())  # at least; a plane has none
+    boxes = [np.prod(np.ptp(run, axis=0) + thickness) for run in np.array_split(places, runs)]
+    return float(np.sum(boxes)) > 2 * float(np.prod(whole + thickness))
+
+
+def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
+    """Points and origins of several blocks, which are left out of the list so that they are not there twice."""
+    points_m = np.concatenate([block.points_m for block in some])
+    origin = np.concatenate([block.origin for block in some])
+    some.clear()
+    return points_m, origin
 
 
 def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:
@@ -115,15 +175,27 @@ def normals_at(surface: Surface, origin: IntArray) -> Array | None:
 
 def random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
     """(K, 3) one random point on each of these faces (K,)."""
-    drawn = rng.random((2, len(faces), 1))
+    return _places(surface, faces, rng.random((2, len(faces))))
+
+
+def _places(surface: Surface, faces: IntArray, drawn: Array) -> Array:
+    """(K, 3) the point on each of these faces (K,) that two numbers drawn from 0 to 1 (2, K) stand for."""
     out = np.empty((len(faces), 3))
     for begin in range(0, len(faces), _PLACES):
-        part = slice(begin, begin + _PLACES)
-        a, b, c = (surface.vertices_m[surface.faces[faces[part], k]] for k in range(3))
-        u, v = drawn[:, part]
+        of, (u, v) = faces[begin : begin + _PLACES], drawn[:, begin : begin + _PLACES]
         folded = u + v > 1
         u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-        out[part] = a + u * (b - a) + v * (c - a)
+        first, last = int(of.min()), int(of.max())
+        if last - first < len(of):  # samples of few faces in a row: each face's edges are computed once
+            corners, at = surface.faces[first : last + 1], of - first
+        else:
+            corners, at = surface.faces[of], None
+        a, b, c = (surface.vertices_m[corners[:, k]] for k in range(3))
+        for k in range(3):
+            one, other, third = a[:, k], b[:, k] - a[:, k], c[:, k] - a[:, k]
+            if at is not None:
+                one, other, third = one[at], other[at], third[at]
+            out[begin : begin + _PLACES, k] = one + u * other + v * third
     return out
 
 

@@ -141,7 +141,7 @@ def closest_on_triangles(points: Array, corners: Array) -> Array:
     v, w = np.where(at_c, 0.0, v), np.where(at_c, 1.0, w)
     v, w = np.where(at_b, 1.0, v), np.where(at_b, 0.0, w)
     v, w = np.where(at_a, 0.0, v), np.where(at_a, 0.0, w)
-    return a + v[:, None] * ab + w[:, None] * ac
+    return np.stack([a[:, k] + v * ab[:, k] + w * ac[:, k] for k in range(3)], axis=1)
 
 
 def _dot(a: Array, b: Array) -> Array:

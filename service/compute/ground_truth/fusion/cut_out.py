@@ -48,7 +48,7 @@ class Markers:
 def without_markers(fused: Fused, markers: Markers) -> Fused:
     """The ground truth without the faces that touch a sphere or a post; where they stood it is open."""
     near = markers.near(fused.surface.vertices_m)
-    surface, kept = compact(fused.surface.vertices_m, fused.surface.faces[~near[fused.surface.faces].any(axis=1)])
+    surface, kept = compact(fused.surface.vertices_m, fused.surface.faces[~fused.surface.touching(near)])
     return replace(
         fused,
         surface=surface,

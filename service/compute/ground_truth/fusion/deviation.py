@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg
 
 from service.compute.ground_truth.fusion.overlap import Mask
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.ground_truth.surface import FACES, IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
@@ -54,13 +54,14 @@ class FieldLengths:
     reach_m: float = 0.006
 
 
-def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: FieldLengths) -> Array:
+def deviation_field(surface: Surface, links: csr_matrix, known_m: Array, known: Mask, lengths: FieldLengths) -> Array:
     """(V,) metres: follows `known_m` where it is `known`, and decays from there along the surface.
 
     It minimises the squared differences over the edges, with weights towards the known values and, elsewhere, 0.
 
     Args:
         surface: a mesh.
+        links: its `adjacency`.
         known_m: (V,) deviations, along the normals.
         known: (V,) where they count.
         lengths: of smoothing and decay.
@@ -68,7 +69,6 @@ def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: Fiel
     Raises:
         ComputeError: the solver does not converge.
     """
-    links = adjacency(surface)
     edge_m = _usual_edge(surface)
     pull = np.where(known, (edge_m / lengths.smoothing_m) ** 2, (edge_m / lengths.reach_m) ** 2)
     diagonal = np.asarray(links.sum(axis=1)).ravel() + pull
@@ -82,18 +82,19 @@ def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: Fiel
     return np.asarray(field, dtype=np.float64)
 
 
-def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
+def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = None) -> tuple[Surface, int]:
     """The surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
 
     Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
     neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
-    neighbours. Faces that still turn over move as one piece with what is around them.
+    neighbours. Faces that still turn over move as one piece with what is around them. `known` is the surface's
+    `adjacency`, if it was computed before.
     """
     points = surface.vertices_m + move_m
-    folded = _folded(surface, points)
+    folded = _folded(surface, points, np.arange(len(surface.faces)))
     if not len(folded):
         return Surface(points, surface.faces), 0
-    links = adjacency(surface)
+    links = adjacency(surface) if known is None else known
     means: csr_matrix = (diags(1 / np.maximum(np.asarray(links.sum(axis=1)).ravel(), 1.0)) @ links).tocsr()
     for rings in (*_ALIKE, *_ROUNDED):
         around = np.zeros(len(points))
@@ -101,24 +102,26 @@ def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
         for _ in range(rings):
             around += links @ around
         chosen = np.flatnonzero(around)
+        mean = means[chosen]
         fixed = surface.vertices_m if rings else np.zeros_like(points)
         for _ in range(_AVERAGED):
             move = points - fixed
-            points[chosen] = fixed[chosen] + 0.5 * (move[chosen] + means[chosen] @ move)
-        folded = _folded(surface, points)
+            points[chosen] = fixed[chosen] + 0.5 * (move[chosen] + mean @ move)
+        folded = _folded(surface, points, np.flatnonzero(surface.touching(around > 0)))  # the others lie as before
         if not len(folded):
             return Surface(points, surface.faces), 0
+    still = folded
     for rings in _STIFF:
         share, piece = _pieces(surface, links, folded, rings)
         move = points - surface.vertices_m
         whole = np.maximum(np.bincount(piece, share), 1.0)  # 0 for vertices of no piece, whose share is 0 too
         mean = np.stack([np.bincount(piece, share * move[:, k]) / whole for k in range(3)], axis=1)
         points = points + share[:, None] * (mean[piece] - move)
-        still = _folded(surface, points)
+        still = _folded(surface, points, np.flatnonzero(surface.touching(share > 0)))
         if not len(still):
             return Surface(points, surface.faces), 0
         folded = np.union1d(folded, still)  # those that lie straight now stay in their pieces
-    return Surface(points, surface.faces), len(_folded(surface, points))
+    return Surface(points, surface.faces), len(still)
 
 
 def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -> tuple[Array, IntArray]:
@@ -167,11 +170,12 @@ def _usual_edge(surface: Surface) -> float:
     return float(np.median(lengths))
 
 
-def _folded(surface: Surface, points_m: Array) -> IntArray:
-    """Indices of the faces whose normal turns by more than a right angle when the vertices move to these points."""
+def _folded(surface: Surface, points_m: Array, of: IntArray) -> IntArray:
+    """Those of some faces whose normal turns by more than a right angle when the vertices move to these points."""
     moved = Surface(points_m, surface.faces)
-    folded = np.empty(len(surface.faces), dtype=np.bool_)
-    for block in surface.blocks():
-        after, before = moved.area_vectors_of(block), surface.area_vectors_of(block)
-        folded[block] = np.einsum("fi,fi->f", after, before) < 0
-    return np.flatnonzero(folded)
+    folded = np.empty(len(of), dtype=np.bool_)
+    for begin in range(0, len(of), FACES):
+        part = slice(begin, begin + FACES)
+        after, before = moved.area_vectors_of(of[part]), surface.area_vectors_of(of[part])
+        folded[part] = np.einsum("fi,fi->f", after, before) < 0
+    return of[folded]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.fusion.deviation import FieldLengths, deviation_field, moved_unfolded
+from service.compute.ground_truth.fusion.deviation import FieldLengths, adjacency, deviation_field, moved_unfolded
 from service.compute.ground_truth.fusion.overlap import (
     Mask,
     OverlapLimits,
@@ -133,9 +133,11 @@ def fuse(
     within = distance_to(carrier.vertices_m, ~usable, chosen.blend_m) / chosen.blend_m
     weight, detail = _smooth_step(within), _smooth_step((within - _DETAIL_FROM) / (1 - _DETAIL_FROM))
     known_m = np.where(usable, -seen.offset_m, 0.0)
-    followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
+    links = adjacency(carrier)
+    followed = deviation_field(carrier, links, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
     onto = seen.nearest_m - carrier.vertices_m
-    moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed))
+    moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed), links)
+    del links
     sigma = _sigma(carrier, weight, np.linalg.norm(onto - followed, axis=1), max(chosen.sigma_ct_m, spread), chosen)
     source = np.where(weight <= 0, Source.CT, np.where(weight >= 1, Source.SCAN, Source.BLEND)).astype(np.uint8)
     fused = Fused(
@@ -188,7 +190,7 @@ def outside(surface: Surface, region: Region) -> Surface:
     inside = region.contains(surface.vertices_m)
     if not inside.any():
         return compact(surface.vertices_m, surface.faces)[0]
-    return compact(surface.vertices_m, surface.faces[~inside[surface.faces].any(axis=1)])[0]
+    return compact(surface.vertices_m, surface.faces[~surface.touching(inside)])[0]
 
 
 def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
@@ -211,11 +213,11 @@ class _Addition:
     def taken(self, carrier: Surface) -> Mask:
         """(F,) faces of the scan that are far from the CT, or touch what was taken away since."""
         far_m = 2 * self.settings.overlap.distance_m
-        vertices, faces = self.scan.vertices_m, self.scan.faces
+        vertices = self.scan.vertices_m
         far = PointIndex(carrier.vertices_m).nearest(vertices, far_m)[0] > far_m
-        taken: Mask = np.all(far[faces], axis=1)
+        taken: Mask = ~self.scan.touching(~far)
         if self.removed is not None:
-            taken |= np.any(self.removed.contains(vertices)[faces], axis=1)
+            taken |= self.scan.touching(self.removed.contains(vertices))
         return taken
 
 

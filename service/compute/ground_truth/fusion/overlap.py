@@ -16,7 +16,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 Mask = NDArray[np.bool_]
-_POINTS = 200_000  # compared with faces at a time, which limits the memory
+_POINTS = 10_000  # compared with faces at a time, which fits into the processor's cache
 _FACES = 1_000_000  # whose connections are looked at together
 
 
@@ -142,7 +142,7 @@ def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | N
     height = ct.vertices_m @ (up / np.linalg.norm(up))
     size, facing = ct.sums_at_vertices(lambda faces: _size_and_facing(ct, faces, up)).T
     rim = np.zeros(len(lacking), dtype=np.bool_)
-    crossing = lacking[ct.faces].any(axis=1) & ~lacking[ct.faces].all(axis=1)
+    crossing = ct.touching(lacking) & ct.touching(~lacking)
     rim[ct.faces[crossing].ravel()] = True
     rim &= lacking
     n = int(labels.max()) + 1
@@ -183,7 +183,9 @@ def _spanning(faces: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDAr
 
     Vertices of number -1 are left out; the others have numbers below n.
     """
-    a, b = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+    one, other, third = faces.T
+    apart = np.flatnonzero(other < 0)  # where the second corner is left out, nothing else connects the two others
+    a, b = np.concatenate([one, other, third[apart]]), np.concatenate([other, third, one[apart]])
     both = (a >= 0) & (b >= 0)
     a, b = a[both], b[both]
     used = np.zeros(n, dtype=np.bool_)

@@ -25,6 +25,6 @@ def fusion_picture(ct: Surface, scan: Surface, score: ChamferScore, scale: HeatS
     """
     palette = np.array([_COLOURS[source] for source in Source], dtype=np.uint8)
     title = "source: " + ", ".join(f"{_WORDS[s]} {100 * fused.share(s):.0f} %" for s in Source)
-    sources = Panel(fused.surface.vertices_m, palette[fused.source], fused.surface.vertex_normals, title)
+    sources = Panel(fused.surface.vertices_m, palette[fused.source], fused.surface.vertex_normals.__getitem__, title)
     picture = heat_picture(ct, scan, score, scale, ("CT", "scan"), (sources,))
     return cv2.imencode(".png", picture)[1].tobytes()

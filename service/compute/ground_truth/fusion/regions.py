@@ -71,7 +71,8 @@ class SphereRegion:
         """(N,) which points (N, 3) lie in it."""
         out = np.zeros(len(points_m), dtype=np.bool_)
         for centre in self.centres_m:
-            out |= np.linalg.norm(points_m - centre, axis=1) <= self.radius_m
+            beside = np.flatnonzero(np.abs(points_m[:, 0] - centre[0]) <= 1.001 * self.radius_m)  # few are
+            out[beside] |= np.linalg.norm(points_m[beside] - centre, axis=1) <= self.radius_m
         return out
 
 
