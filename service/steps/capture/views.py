@@ -36,6 +36,7 @@ from service.steps.capture.exposure import (
 )
 from service.steps.capture.further_cameras.images import exposing_at, settings_of
 from service.steps.capture.motion import MotionLimits, move_and_settle, require_there, settle_criteria
+from service.steps.capture.plan.planning import posture_without_plan
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.capture.retakes import taken_for_good
 from service.steps.context import FurtherCamera, StepContext
@@ -317,8 +318,8 @@ class _CaptureLoop:
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
         """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
-        near = robot.state().sample.joints_rad if viewpoint.joints_rad is None else viewpoint.joints_rad
-        return robot.solve_ik(flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), near)
+        target, near = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), viewpoint.joints_rad
+        return robot.solve_ik(target, posture_without_plan(self.context, robot, target) if near is None else near)
 
     def _solve_ahead(self, robot: RobotArm, later: Sequence[Viewpoint]) -> None:
         """Solve for the next viewpoint's joints while the arm rests before the exposure, which takes 0.1 s."""
