@@ -21,8 +21,6 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
-from service.compute.arm.inverse_kinematics import nearest_posture
-from service.core.arms.known import known_arm
 from service.core.geometry import Array, Transform
 from service.core.records.events import ViewpointFailed
 from service.core.units import megapixels
@@ -38,6 +36,7 @@ from service.steps.capture.exposure import (
 )
 from service.steps.capture.further_cameras.images import exposing_at, settings_of
 from service.steps.capture.motion import MotionLimits, move_and_settle, require_there, settle_criteria
+from service.steps.capture.plan.planning import posture_without_plan
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.capture.retakes import taken_for_good
 from service.steps.context import FurtherCamera, StepContext
@@ -319,15 +318,8 @@ class _CaptureLoop:
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
         """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
-        target = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera)
-        near = viewpoint.joints_rad
-        if near is None:  # not planned: in the posture that a plan would take, not in one that is as near by its sum
-            here = robot.state().sample.joints_rad
-            collision, _ = self.context.devices.surroundings()
-            model = known_arm(collision.arm or robot.report().identity.model)
-            own = None if model is None or model.axes != len(here) else nearest_posture(model, target, here)
-            near = here if own is None else own
-        return robot.solve_ik(target, near)
+        target, near = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), viewpoint.joints_rad
+        return robot.solve_ik(target, posture_without_plan(self.context, robot, target) if near is None else near)
 
     def _solve_ahead(self, robot: RobotArm, later: Sequence[Viewpoint]) -> None:
         """Solve for the next viewpoint's joints while the arm rests before the exposure, which takes 0.1 s."""

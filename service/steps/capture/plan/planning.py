@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from drivers.interfaces import RobotArm
 from service.compute.arm.inverse_kinematics import nearest_posture
 from service.compute.planning.collision import ArmBody, Capsule, Obstacles
 from service.compute.planning.motion_plan import (
@@ -126,6 +127,17 @@ def arm_at_station(context: StepContext, station: str, T_flange_camera: Transfor
         return None
     _require_slow_enough(context, layout, model)
     return ArmAtStation(layout, model, T_flange_camera, collision, optics, context.protocol.motion)
+
+
+def posture_without_plan(context: StepContext, robot: RobotArm, T_base_flange: Transform) -> Array:
+    """Joints (N,) near which a controller solves a pose that nobody planned: those that a plan would take.
+
+    A controller may as well choose a posture with the wrist turned over, from which the next ways are blocked.
+    """
+    here = robot.state().sample.joints_rad
+    model = known_arm(context.devices.surroundings()[0].arm or robot.report().identity.model)
+    found = None if model is None or model.axes != len(here) else nearest_posture(model, T_base_flange, here)
+    return here if found is None else found
 
 
 def _require_slow_enough(context: StepContext, layout: StationLayout, model: ArmModel) -> None:
