@@ -61,7 +61,7 @@ FILES = "what names a patient or a person in the headers of files"
 _KEPT_TEXTS = {"Sony": {"d040", "d07b", "d1ca"}, "Nikon": {"d0e3"}, "Canon": {"d1d8"}}
 _PROGRAM = re.compile(r"(?:Loaded program: |true |false |[A-Z]+ )?(?P<name>.+)$")
 _NO_PROGRAM = ("<unnamed>", "No program loaded")
-_GRBL_NAME = re.compile(r"VER:[^:]*:(?P<name>[^\]]+)")
+_VERSION_WITH_NAME = re.compile(r"VER:[^:]*:(?P<name>[^\]]+)")
 
 
 def without_personal_data(recording: Recording, secrets: Secrets | None = None) -> Recording:
@@ -116,7 +116,7 @@ def _of_answer(question: str, answer: str) -> Iterator[tuple[str, str]]:
         yield from ((part.strip(), "serial number") for part in answer.split(",")[2:3])
     elif "program" in question and (found := _PROGRAM.match(answer)) and found["name"] not in _NO_PROGRAM:
         yield found["name"], "program"
-    elif found := _GRBL_NAME.search(answer):
+    elif found := _VERSION_WITH_NAME.search(answer):
         yield found["name"], "serial number"
 
 

@@ -54,6 +54,6 @@ def serve(args: argparse.Namespace) -> None:
     if args.replay:
         body.fill_card()
     if args.old_file:
-        body.shoot()
+        body.shoot().join()  # the file is there before anybody opens the body
     server = SonyServer(args.host, args.port, body, args.faults)
     serve_until_stopped(server, body, termination, not_recorded(args))

@@ -122,8 +122,8 @@ class CameraBody(ABC):
         except (BusyError, CardFullError):
             _LOG.warning("the button was pressed while the body was busy or full")
 
-    def shoot(self) -> None:
-        """Begin an exposure. Raises BusyError or CardFullError."""
+    def shoot(self) -> threading.Thread:
+        """Begin an exposure, and return the thread that makes it. Raises BusyError or CardFullError."""
         settings = self.exposure_settings()
         if self._exposing.is_set():
             raise BusyError
@@ -134,7 +134,11 @@ class CameraBody(ABC):
         counter = self._counter
         self._counter += 1
         self.begun()
-        threading.Thread(target=self._expose, args=(counter, settings, fault), name="exposure", daemon=True).start()
+        exposing = threading.Thread(
+            target=self._expose, args=(counter, settings, fault), name="exposure", daemon=True
+        )
+        exposing.start()
+        return exposing
 
     def _expose(self, counter: int, settings: ExposureSettings, fault: Fault | None) -> None:
         started = time.monotonic()

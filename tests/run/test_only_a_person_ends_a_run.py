@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ from service.store.durable_effects import DurableFiles
 from service.store.store import Store
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.rig.bench_rig import answer
-from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, say
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, Squeezed, begin_run, say
 
 
 class OddError(Exception):
@@ -106,14 +105,6 @@ def test_a_driver_that_was_killed_is_asked_about_and_not_tried_again_before(benc
     assert bench.run().status == "completed"
     assert [f.error for f in bench.payloads(StepFailed)] == ["DriverKilledError"]
     assert bench.captured() == VIEWS
-
-
-@dataclass
-class Squeezed:
-    """A program that could not run for this long, and for this share of the time in which it wanted to."""
-
-    seconds: float
-    share: float
 
 
 @pytest.mark.parametrize("late", [DeviceTimeoutError, DeviceUnavailableError, MachineBusyError])

@@ -13,7 +13,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
-from service.runner.execution import Starvation, held_up_here
+from service.runner.execution import Starvation
 from service.runner.loop import Runner
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
@@ -67,6 +67,19 @@ P = TypeVar("P")
 
 
 @dataclass
+class Squeezed:
+    """A program that could not run for this long, and for this share of the time in which it wanted to."""
+
+    seconds: float
+    share: float
+
+
+def unhindered() -> Squeezed:
+    """Measure nothing of the machine on which the tests run: how busy that is decides no test."""
+    return Squeezed(0.0, 0.0)
+
+
+@dataclass
 class Bench:
     """One run on an in-memory rig, which lives by the store's clock."""
 
@@ -77,7 +90,7 @@ class Bench:
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
     second_place: SecondPlace | None = None
-    held_up: Callable[[], Starvation] = held_up_here
+    held_up: Callable[[], Starvation] = unhindered
     on_wait: Callable[[float], None] | None = None  # called when the runner waits, in a store of `bench_store`
 
     @property
