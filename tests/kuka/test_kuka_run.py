@@ -96,7 +96,7 @@ def test_each_arm_has_a_correction_of_seven_joints_of_its_own(run: Run) -> None:
         found.append(calibrate.KIND.read_answer(steps[name].result or {}))
     corrections = [one.hand_eye.arm_correction for one in found if one.hand_eye is not None]
     deltas = [np.array(one.dh_deltas) for one in corrections if one is not None]
-    assert [one.shape for one in deltas] == [(7, 4), (7, 4)]
+    assert [one.shape for one in deltas] == [(7, 5), (7, 5)]
     assert not np.allclose(deltas[0], deltas[1])
 
 

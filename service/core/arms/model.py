@@ -42,6 +42,8 @@ class ArmTolerances:
         lengths_m: of a and d, joint by joint; empty: those of `dh` for all.
         twists_rad: of α, joint by joint; empty: that of `dh` for all.
         parallel_rad: of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
+        weight: of how many parameters their common scale is known to be about 1, because they were measured on such
+            arms; 0: they are assumed, and the images alone tell the scale.
         gear_rad: amplitude of each harmonic of a gear's error.
         harmonics: periods per revolution that are estimated are 1 … this number.
     """
@@ -50,6 +52,7 @@ class ArmTolerances:
     lengths_m: tuple[tuple[float, float], ...] = ()
     twists_rad: tuple[float, ...] = ()
     parallel_rad: float = float(np.radians(0.015))
+    weight: float = 0.0
     gear_rad: float = float(np.radians(0.01))
     harmonics: int = 10  # tens of poses cannot tell faster ones from noise
 

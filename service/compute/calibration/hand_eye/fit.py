@@ -142,7 +142,8 @@ class HandEyeMeasurements:
         near = correction_of(self.arm, about, np.zeros(self.arm.axes))
         hands = corrected_T_base_flange(self.joints_rad, self.hands, near)
         design = correction_design(self.arm, self.joints_rad, near)[:, :, : len(kind)]
-        return BoardViews(hands, self.boards, self.covariance, design, kind, about, self.size_sigma)
+        known = self.arm.tolerances.weight
+        return BoardViews(hands, self.boards, self.covariance, design, kind, about, self.size_sigma, known)
 
     def placed(self, answer: HandEyeSolution) -> Array:
         """(N, 4, 4) T_base_board from each view alone."""

@@ -42,10 +42,7 @@ _SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix
 _COMMON = 13  # parameters before the arm's: two transforms and the board's scale
 _SCALE = 12  # index of the board's scale among them
 _LEAST_SIGMA = 1e-9  # of the scale: a board known to 1e-9 is exactly known
-#: Scales of the arm's geometry are about 1, for its tolerances were measured on such arms. This counts as much as so
-#: many parameters that are known: few images show few lengths, and these can by chance be right.
 GEOMETRY_KINDS = 3  # lengths, twists, zeros of joints: the first scales
-_KNOWN_ARMS = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +57,8 @@ class BoardViews:
         kind: (K,) index into `Noise.scales` of each parameter's prior scale.
         about: (K,) the arm's parameters at which `design` is the derivative.
         size_sigma: relative standard deviation of the board's stated size.
+        scales_weight: the scales of the geometry are known to be about 1 as if that many parameters showed it: few
+            images show few lengths, and a scale of these alone would vanish where they are right by chance.
     """
 
     T_base_flange: Array
@@ -69,6 +68,7 @@ class BoardViews:
     kind: NDArray[np.int64]
     about: Array
     size_sigma: float
+    scales_weight: float = 0.0
 
     @property
     def size_precision(self) -> float:
@@ -85,6 +85,7 @@ class BoardViews:
             self.kind,
             self.about,
             self.size_sigma,
+            self.scales_weight,
         )
 
 
@@ -275,7 +276,7 @@ def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float
         value += 0.5 * (np.sum(left**2) + np.sum(step[_COMMON:] ** 2 / prior))
         value += 0.5 * views.size_precision * (near.scale - 1 + step[_SCALE]) ** 2
         squares = np.array(noise.scales[:GEOMETRY_KINDS]) ** 2
-        value += 0.5 * _KNOWN_ARMS * np.sum(np.log(squares) + 1 / squares)
+        value += 0.5 * views.scales_weight * np.sum(np.log(squares) + 1 / squares)
         # d/dV of each term, only the diagonal: the robot's variances are diagonal.
         inverse_L = np.linalg.inv(L)
         trace = np.sum(inverse_L**2, axis=1)
@@ -286,7 +287,7 @@ def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float
         scales = np.zeros(len(members))
         if len(prior):
             scales += members @ (1 - (np.diag(covariance)[_COMMON:] + step[_COMMON:] ** 2) / prior)
-            scales[:GEOMETRY_KINDS] += _KNOWN_ARMS * (1 - 1 / squares)
+            scales[:GEOMETRY_KINDS] += views.scales_weight * (1 - 1 / squares)
         return float(value), np.array([*robot, *scales])
 
     first = np.log([max(start.robot_m, floor_m), max(start.robot_rad, floor_m), *start.scales])
@@ -320,7 +321,7 @@ def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np
     gram = _with_prior(_grams(views, noise, near).sum(axis=0), views, near.scale)
     members = (groups == np.arange(groups.max() + 1)[:, None]).astype(np.float64)
     size = members.sum(axis=1)
-    known = np.where(np.arange(len(size)) < GEOMETRY_KINDS, _KNOWN_ARMS, 0.0)
+    known = np.where(np.arange(len(size)) < GEOMETRY_KINDS, views.scales_weight, 0.0)
     square = np.array([float(np.mean(_prior(noise, views.kind)[groups == g])) for g in range(len(size))])
     for round_ in range(_SELECTION_ROUNDS):
         step, covariance, _ = _minimum(gram, square[groups])

@@ -29,6 +29,7 @@ _TOLERANCES = ArmTolerances(
     lengths_m=((1.6e-4, 2.0e-4), (3.3e-4, 1e-4), (2.5e-4, 1e-4), (1.1e-4, 6.5e-4), (1.3e-4, 1.3e-4), (1e-4, 6e-4)),
     twists_rad=tuple(float(v) for v in np.radians([0.05, 0.08, 0.34, 0.06, 0.05, 0.05])),
     parallel_rad=float(np.radians(0.08)),
+    weight=8.0,
 )
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
