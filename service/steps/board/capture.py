@@ -51,7 +51,7 @@ class BoardCapture:
     wanted: BoardPoses
     board: Board
     solve: tuple[str, ...]
-    given: tuple[Viewpoint, ...] = ()  # poses of the protocol; only replacements are planned then
+    given: tuple[Viewpoint, ...] = ()  # poses of the protocol, in its order; only replacements are chosen then
     camera: Camera | None = None  # calibrated by an earlier step
     earlier: str | None = None  # step whose board images show where board and mount are
     _known: BoardKnowledge | None = None
@@ -282,11 +282,10 @@ class BoardCapture:
         todo = [v for v in poses if v.name not in done]
         refused: Mapping[str, str] = {}
         stands_rad: dict[str, Array] = {}
-        if todo and not self.given:
+        if todo:
             board = self._knowledge(self.looks(wait=False)).T_base_board
-            planned = plan_step(
-                self.context, todo, self._mount, "shortest", sharp_at_m=apply(board, self.board.points())
-            )
+            order = "as_listed" if self.given else "shortest"
+            planned = plan_step(self.context, todo, self._mount, order, sharp_at_m=apply(board, self.board.points()))
             todo, refused, stands_rad = list(planned.viewpoints), planned.refused, dict(planned.starts_rad)
         task = CaptureTask(
             [*todo, *(v for v in poses if v.name in done)],
