@@ -137,6 +137,8 @@ def test_a_board_seen_in_part_still_counts_when_further_poses_were_added(begin: 
     assert first.measures["views_partial"] == last.measures["views_partial"] == 1
     assert first.measures["views"] == 7, "six listed, one of them in part, and its replacement"
     assert last.measures["views"] == 8
+    planned = [line for line in bench.operator.told if "the kinematics of the arm are not known" in line]
+    assert len(planned) >= 2, "listed poses and replacements are planned as others are, were the arm known"
 
 
 @pytest.mark.slow
