@@ -13,6 +13,7 @@ from pydantic import Field, field_validator
 
 from drivers.errors import DeviceUnavailableError, IncompleteExportError
 from drivers.interfaces import DeviceAnswers, DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
+from drivers.interfaces.answers import answers_of_headers
 from drivers.meshes.export_watch import ExportWatch, mesh_files
 from drivers.meshes.foreign_text import name_of
 from drivers.meshes.header_lines import header_lines
@@ -93,11 +94,7 @@ class ScanFolder:
         """The headers of the newest files that a scanner may have exported, complete or not."""
         require_folder(self._config.folder)
         files = sorted(mesh_files(self._config.folder, _SURFACES), key=_modified_ns)
-        said = [header_lines(path) for path in files[-_MOST_HEADERS:]]
-        return DeviceAnswers(
-            headers=tuple(one for one in said if not isinstance(one, str)),
-            silent=tuple(one for one in said if isinstance(one, str)),
-        )
+        return answers_of_headers(map(header_lines, files[-_MOST_HEADERS:]))
 
     def exports(self) -> tuple[ScanExport, ...]:
         """Return the complete exports that this driver has seen unchanged for `stable_s`, oldest first."""

@@ -52,6 +52,7 @@ INTERFACES: Mapping[str, type[Any]] = {
     "lightbox": Lightbox,
 }
 _PATH_FIELDS = ("folder", "port", "path")
+_PLACE_FIELDS = (*_PATH_FIELDS, "host", "camera")  # what they say is not for strangers
 _ADDRESS_FIELDS = ("host", "port", "camera", "model")  # the first that a device has says which one it is
 _ANY_PORT = ("usb", "usb:")
 _ACTING = ("robot", "camera", "lightbox")
@@ -380,7 +381,7 @@ class Station:
 def _secrets_of(config: DriverConfig) -> Secrets:
     """What a device's section of the rig file tells of the site, and the names of files where it exports."""
     settings = {field: str(value) for field, value in config.model_dump().items() if isinstance(value, str | Path)}
-    addresses = [value for field, value in settings.items() if field in (*_PATH_FIELDS, *_ADDRESS_FIELDS[:3])]
+    addresses = [value for field, value in settings.items() if field in _PLACE_FIELDS]
     folder = Path(settings["folder"]) if settings.get("folder") else None
     files = [] if folder is None or not folder.is_dir() else [path.name for path in folder.rglob("*")]
     return {

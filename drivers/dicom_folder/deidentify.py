@@ -96,7 +96,7 @@ def _write_clean(source: Path, target: Path, removed: set[str]) -> None:
         raise _refused(source, "it states that text is burned into its pixels, which may name a person")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        clean = FileDataset(str(target), kept(dataset, removed), file_meta=_meta(dataset), preamble=b"\0" * 128)
+        clean = FileDataset(str(target), copy_kept(dataset, removed), file_meta=_meta(dataset), preamble=b"\0" * 128)
         for name in _EMPTY:
             setattr(clean, name, "")
         clean.PatientIdentityRemoved = "YES"
@@ -104,8 +104,8 @@ def _write_clean(source: Path, target: Path, removed: set[str]) -> None:
         pydicom.dcmwrite(target, clean, enforce_file_format=True)
 
 
-def kept(dataset: Dataset, removed: set[str], within: str = "") -> Dataset:
-    """A copy with the kept attributes, UIDs replaced; the names of the others are added to `removed`."""
+def copy_kept(dataset: Dataset, removed: set[str], within: str = "") -> Dataset:
+    """Copy the kept attributes, with UIDs replaced; the names of the others are added to `removed`."""
     clean = Dataset()
     for element in _elements(dataset):
         name = element.keyword
@@ -113,7 +113,7 @@ def kept(dataset: Dataset, removed: set[str], within: str = "") -> Dataset:
             if not (name in _EMPTY and element.is_empty):
                 removed.add(within + _named(element))
         elif element.VR == "SQ":
-            inside = [kept(item, removed, f"{within}{name}/") for item in element.value]
+            inside = [copy_kept(item, removed, f"{within}{name}/") for item in element.value]
             clean.add(DataElement(element.tag, "SQ", inside))
         elif element.VR == "UI" and name not in _UNCHANGED_UIDS:
             clean.add(DataElement(element.tag, "UI", _replaced(element.value)))

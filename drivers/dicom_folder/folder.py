@@ -33,6 +33,7 @@ from drivers.interfaces import (
     ScanExport,
     ScannedMesh,
 )
+from drivers.interfaces.answers import answers_of_headers
 from drivers.meshes.export_watch import ExportWatch
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.scan_folder import free_bytes, require_folder
@@ -108,11 +109,7 @@ class DicomFolder:
     def answers(self) -> DeviceAnswers:
         """The header of one file of each series and each segmentation."""
         firsts = [headers[0].path for headers in self._groups().values()][-_MOST_HEADERS:]
-        said = [header_lines(path) for path in firsts]
-        return DeviceAnswers(
-            headers=tuple(one for one in said if not isinstance(one, str)),
-            silent=tuple(one for one in said if isinstance(one, str)),
-        )
+        return answers_of_headers(map(header_lines, firsts))
 
     def series(self) -> tuple[CtSeries, ...]:
         """Return all series with images, including those with problems, oldest first.

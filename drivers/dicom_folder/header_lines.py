@@ -11,7 +11,7 @@ from pathlib import Path
 from pydicom.dataset import Dataset
 from pydicom.uid import UID
 
-from drivers.dicom_folder.deidentify import kept
+from drivers.dicom_folder.deidentify import copy_kept
 from drivers.dicom_folder.files import PARSE_ERRORS, read_dicom
 from drivers.interfaces import FileHeader
 from drivers.interfaces.answers import SERIES_DESCRIPTION
@@ -25,7 +25,7 @@ def header_lines(path: Path) -> FileHeader | str:
     removed: set[str] = set()
     try:
         dataset = read_dicom(path, header_only=True)
-        lines = list(_lines(kept(dataset, removed)))
+        lines = list(_lines(copy_kept(dataset, removed)))
         description = str(dataset.get("SeriesDescription") or "")
         syntax = str(dataset.file_meta.get("TransferSyntaxUID", "")) if hasattr(dataset, "file_meta") else ""
         size = path.stat().st_size

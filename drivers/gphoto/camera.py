@@ -21,7 +21,7 @@ from drivers.errors import (
 )
 from drivers.gphoto.dials import NOT_TOLD, Dials
 from drivers.gphoto.link import AddedFile, Link, gp, library_version
-from drivers.gphoto.listing import listed
+from drivers.gphoto.listing import list_properties
 from drivers.gphoto.profile import Profile, battery_fraction
 from drivers.gphoto.profiles import profile_for
 from drivers.gphoto.room import Room
@@ -184,7 +184,7 @@ class GphotoCamera:
 
     def answers(self) -> DeviceAnswers:
         """List all properties of the body, also of one that `open` refused."""
-        return listed(self._link)
+        return list_properties(self._link)
 
     def _battery(self) -> float | None:
         try:

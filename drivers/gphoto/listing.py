@@ -35,8 +35,8 @@ _PLAIN_PTP, _STEPPED, _DIRECT = 100, 200, 300
 _ONLY_3_00 = "d253"
 
 
-def listed(link: Link) -> DeviceAnswers:
-    """All that an open body states. Raises DeviceError if it states nothing."""
+def list_properties(link: Link) -> DeviceAnswers:
+    """List all that an open body states. Raises DeviceError if it states nothing."""
     try:
         listing = listing_of(link.summary())
     except ValueError as error:
@@ -80,7 +80,7 @@ def listing_of(summary: str) -> Listing:
     for line in summary.splitlines():
         if found := _CONTROL.search(line):
             controls.append(found["code"])
-        elif (found := _NEW.search(line) or _OLD.search(line)) and (told := _stated(found)):
+        elif (found := _NEW.search(line) or _OLD.search(line)) and (told := _parse_property(found)):
             if told.code in properties:
                 controls.append(told.code)  # some are listed again, among the controls
             properties.setdefault(told.code, told)
@@ -95,8 +95,8 @@ def listing_of(summary: str) -> Listing:
     )
 
 
-def _stated(found: re.Match[str]) -> PtpProperty | None:
-    """A property; None where the listing cuts it off or its kind is not known."""
+def _parse_property(found: re.Match[str]) -> PtpProperty | None:
+    """Parse a property; None where the listing cuts it off or its kind is not known."""
     kind = _TYPES.get(found["kind"], found["kind"])
     access = "rw" if found["access"] in ("rw", "readwrite") else "ro"
     code, rest = found["code"], found["rest"].strip()

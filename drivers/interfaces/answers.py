@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -72,6 +73,15 @@ class DeviceAnswers(Part):
     samples: tuple[Sample, ...] = ()
     headers: tuple[FileHeader, ...] = ()
     silent: tuple[str, ...] = Field(default=(), description="what was asked in vain, and why")
+
+
+def answers_of_headers(read: Iterable[FileHeader | str]) -> DeviceAnswers:
+    """The answers of a folder: what was read of each file is its header, or a sentence that says why it has none."""
+    every = tuple(read)
+    return DeviceAnswers(
+        headers=tuple(header for header in every if isinstance(header, FileHeader)),
+        silent=tuple(reason for reason in every if isinstance(reason, str)),
+    )
 
 
 @runtime_checkable

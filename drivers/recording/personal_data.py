@@ -66,7 +66,7 @@ _VERSION_WITH_NAME = re.compile(r"VER:[^:]*:(?P<name>[^\]]+)")
 
 def without_personal_data(recording: Recording, secrets: Secrets | None = None) -> Recording:
     """The recording without what TABLE names; `secrets` are texts that the rig file or a folder told."""
-    known = {text: what for text, what in (*(secrets or {}).items(), *_told(recording)) if _is_worth(text)}
+    known = {text: what for text, what in (*(secrets or {}).items(), *_find_secrets(recording)) if _is_worth(text)}
     mask = _Mask(known)
     data = recording.model_dump(mode="json", exclude_defaults=True)
     for device in data["devices"].values():
@@ -96,8 +96,8 @@ def _clean_answers(answers: Any, mask: _Mask) -> None:
                 one["value"] = mask.text(one["value"]) if one["code"] in kept else ""
 
 
-def _told(recording: Recording) -> Iterator[tuple[str, str]]:
-    """What devices told of themselves, and each of its kind."""
+def _find_secrets(recording: Recording) -> Iterator[tuple[str, str]]:
+    """Find what devices told of themselves, each with its kind."""
     for device in recording.devices.values():
         if device.report is not None:
             yield device.report.identity.serial, "serial number"
@@ -106,10 +106,10 @@ def _told(recording: Recording) -> Iterator[tuple[str, str]]:
             if line.startswith(SERIES_DESCRIPTION):
                 yield line.removeprefix(SERIES_DESCRIPTION), "description"
         for exchange in device.answers.exchanges:
-            yield from _of_answer(exchange.question.lower(), exchange.answer)
+            yield from _find_in_answer(exchange.question.lower(), exchange.answer)
 
 
-def _of_answer(question: str, answer: str) -> Iterator[tuple[str, str]]:
+def _find_in_answer(question: str, answer: str) -> Iterator[tuple[str, str]]:
     if "serial" in question:
         yield answer, "serial number"
     elif question.startswith("*idn"):

@@ -190,7 +190,7 @@ def copying_alone(log: Path) -> Generator[None]:
         yield
         return
     except OSError as error:
-        raise unread(log, error) from error
+        raise unreadable(log, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -198,7 +198,7 @@ def copying_alone(log: Path) -> Generator[None]:
         os.close(descriptor)
 
 
-def unread(path: Path, error: OSError) -> StoreError:
+def unreadable(path: Path, error: OSError) -> StoreError:
     """The error of a log of signatures, or of a copy of it, that cannot be read."""
     return StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK)
 
@@ -226,7 +226,7 @@ def _content(path: Path, offset: int) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise unread(path, error) from error
+        raise unreadable(path, error) from error
 
 
 def _parsed(content: bytes, end: LogEnd) -> Iterator[tuple[LogLine, LogEnd]]:

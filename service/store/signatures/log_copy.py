@@ -8,7 +8,7 @@ from pathlib import Path
 from service.core.errors import IntegrityError, StoreError
 from service.store.durable_effects import DurableFiles, Files
 from service.store.journal.copies import journal_copy, journal_copy_faults
-from service.store.signatures.log import NAME, copying_alone, unread
+from service.store.signatures.log import NAME, copying_alone, unreadable
 from service.store.verification.chain_checks import Fault
 
 _FILES = DurableFiles()
@@ -105,4 +105,4 @@ def _bytes(path: Path, offset: int = 0) -> bytes:
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise unread(path, error) from error
+        raise unreadable(path, error) from error
