@@ -16,6 +16,7 @@ from tests.support.pages.browser import (
     accessibility_faults,
     add_people,
     screen,
+    scripts_held_back,
     served,
 )
 from tests.support.recorded.unpacked_run import unpack_recorded_run
@@ -105,6 +106,11 @@ def test_another_view_and_another_split_are_chosen(tablet: Screen) -> None:
     expect(page.get_by_alt_text(f"Photograph of view {names[-2]}")).to_be_visible()
     page.locator(".view-link").first.click()
     expect(page.get_by_alt_text(f"Photograph of view {names[0]}")).to_be_visible()
+    with scripts_held_back(page) as come:
+        page.reload(wait_until="commit")
+        page.locator("select[name=view]").select_option(names[-1])
+        come()
+    expect(page.get_by_alt_text(f"Photograph of view {names[-1]}")).to_be_visible()
 
 
 @pytest.mark.slow

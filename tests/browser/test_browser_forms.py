@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import parse_protocol
@@ -14,7 +14,7 @@ from service.core.records.events import OperatorAction, StepFailed, StepMeasured
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.pages.at_the_table import STANDING, at_the_table, record
-from tests.support.pages.browser import Screen, Served, screen, served
+from tests.support.pages.browser import Screen, Served, screen, scripts_held_back, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
 from tests.support.record.core import EYE
@@ -61,20 +61,6 @@ def next_image(server: Served, run_id: str, name: str) -> None:
         capture(web, run_id, "capture", name, EYE, shade=int(name[-1]))
 
 
-@contextmanager
-def scripts_held_back(tablet: Screen) -> Generator[Callable[[], None]]:
-    """Keep the page's scripts on their way, as a slow network does, until what is yielded is called."""
-    waiting: list[Route] = []
-    tablet.page.route("**/*.js", lambda route: waiting.append(route))  # noqa: PLW0108 - the library marks its handlers
-
-    def come() -> None:
-        while waiting:
-            waiting.pop().continue_()
-        tablet.page.unroute("**/*.js")
-
-    yield come
-
-
 def open_redo_with_a_reason(page: Page) -> None:
     page.get_by_text("Redo v1_001…").click()
     page.get_by_label("Reason in your own words").fill("a drape hung into it")
@@ -102,12 +88,16 @@ def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Serv
 
 @pytest.mark.slow
 def test_what_was_typed_before_the_scripts_had_come_counts(server: Served, browser: Browser) -> None:
-    with capturing(server, browser) as (tablet, run_id), scripts_held_back(tablet) as come:
+    with capturing(server, browser) as (tablet, run_id), scripts_held_back(tablet.page) as come:
         page = tablet.page
         page.reload(wait_until="commit")
         open_redo_with_a_reason(page)
-        come()
         button = page.get_by_role("button", name="Redo v1_001")
+        instead_of_hold = page.locator("details[open] [data-instead-of-hold]")
+        expect(instead_of_hold).to_have_count(1)
+        come()
+        expect(instead_of_hold).to_have_count(0, timeout=LATER_MS)
+        expect(page.get_by_label("Something else, in my own words")).to_be_checked()
         button.focus()
         page.keyboard.down("Enter")
         expect(page.locator("details[open] form")).to_have_count(0, timeout=LATER_MS)
@@ -122,7 +112,7 @@ def test_no_tap_sends_what_must_be_held_before_the_scripts_have_come(server: Ser
         page = tablet.page
         go = page.get_by_role("button", name="Confirm: the robot takes 4 images")
         expect(go).to_be_enabled(timeout=LATER_MS)
-        with scripts_held_back(tablet) as come:
+        with scripts_held_back(tablet.page) as come:
             page.reload(wait_until="commit")
             go.click()
             page.wait_for_timeout(500)

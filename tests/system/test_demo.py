@@ -158,8 +158,20 @@ def test_every_image_was_looked_at_while_the_specimen_was_there(
     last = steps["control_capture_2"]["measures"]
     assert 0 < last["predicted_target_error_mm"] <= max(looked_at)
     assert 0.6 <= last["specimen_coverage"] <= 1
-    plans = [event for event in events if "note=motion_plan" in event["summary"]]
-    assert len(plans) == 4, "recorded before the first motion of each capture"
+    planned = _first_by_step(events, "step_note", "note=motion_plan")
+    moved = _first_by_step(events, "viewpoint_captured", "station=")
+    assert set(planned) == set(moved) > {"camera_calibration", "viewpoint_capture_1"}
+    assert all(planned[step] < moved[step] for step in moved), "recorded before the first motion of each capture"
+
+
+def _first_by_step(events: list[dict[str, Any]], kind: str, words: str) -> dict[str, int]:
+    """The sequence number of each step's first event of a kind with these words in its summary."""
+    first: dict[str, int] = {}
+    for event in events:
+        step = re.match(r"step=(\w+)", event["summary"])
+        if event["kind"] == kind and step is not None and words in event["summary"]:
+            first.setdefault(step[1], event["seq"])
+    return first
 
 
 def test_no_job_holds_a_copy_of_what_an_earlier_one_found(demo: dict[str, Any]) -> None:

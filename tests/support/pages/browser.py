@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.base import AXE_SCRIPT
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Locator, Page, Route, expect, sync_playwright
 
 from service.people.roles import Role
 from service.people.sessions import People
@@ -265,6 +265,20 @@ def screen(
     finally:
         context.close()
     assert not complaints, complaints
+
+
+@contextmanager
+def scripts_held_back(page: Page) -> Generator[Callable[[], None]]:
+    """Keep the page's scripts on their way, as a slow network does, until what is yielded is called."""
+    waiting: list[Route] = []
+    page.route("**/*.js", lambda route: waiting.append(route))  # noqa: PLW0108 - the library marks its handlers
+
+    def come() -> None:
+        while waiting:
+            waiting.pop().continue_()
+        page.unroute("**/*.js")
+
+    yield come
 
 
 def accessibility_faults(page: Page) -> list[str]:

@@ -8,7 +8,10 @@ function follow() {
 }
 
 document.addEventListener("input", (event) => { if (event.target.id === "depth-slider") follow(); });
-document.addEventListener("change", (event) => {
-  if (event.target.matches(".view-choice select")) event.target.form.requestSubmit();
-});
+const CHOICE = ".view-choice select";
+document.addEventListener("change", (event) => { if (event.target.matches(CHOICE)) event.target.form.requestSubmit(); });
 follow(); // a browser that goes back keeps the slider where it was
+// What was chosen before this script had come.
+for (const choice of document.querySelectorAll(CHOICE)) {
+  if (!choice.selectedOptions[0].defaultSelected) choice.form.requestSubmit();
+}
