@@ -138,16 +138,23 @@ class _Capture:
         return capture_viewpoints(self._context, task)
 
     def repeat_spoilt(self, live: LiveAnalysis, totals: CaptureTotals) -> tuple[CaptureTotals, Mapping[str, str]]:
-        """Take spoilt images again, once; the new totals, and the reason of each image that is spoilt again."""
-        spoilt = live.spoilt()
-        if spoilt:
+        """Take spoilt images again, once each; the new totals, and the reason of each image that is spoilt again.
+
+        An image whose job ends only while others are taken again is taken again after them.
+        """
+        repeated: set[str] = set()
+        while True:
+            spoilt = live.spoilt()
+            due = [viewpoint for viewpoint in self.of_images(spoilt) if viewpoint.name not in repeated]
+            if not due:
+                break
+            repeated |= {viewpoint.name for viewpoint in due}
             for capture in self._context.evidence.captures(self._context.step.id):
                 why = spoilt.get(capture.artefacts[0].sha256)
-                if why is not None:
+                if why is not None and capture.viewpoint in repeated:
                     self._context.tell(f"{capture.viewpoint}: {why}; it is taken again")
-            repeated = self.take(self._planned(self.of_images(spoilt)), spoilt)
-            totals = replace(repeated, planned=totals.planned, given_up=totals.given_up)
-            spoilt = live.spoilt()
+            again = self.take(self._planned(due), spoilt)
+            totals = replace(again, planned=totals.planned, given_up=totals.given_up)
         live.note_spoilt(spoilt)
         return totals, spoilt
 
