@@ -8,8 +8,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +38,7 @@ from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.plan.planning import ArmAtStation, posture_without_plan, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.steps.capture.plan.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
@@ -130,20 +128,6 @@ def test_shoulder_elbow_and_wrist_keep_their_sides_though_the_camera_must_turn_f
     assert np.sign(np.sin(found[4])) == np.sign(np.sin(BEFORE_RAD[4]))
     assert np.sign(found[2]) == np.sign(BEFORE_RAD[2])
     assert found[5] - BEFORE_RAD[5] > 3.0
-
-
-@pytest.mark.parametrize(("model", "planned"), [("UR10e", True), ("an arm that nobody knows", False)])
-def test_a_pose_without_a_plan_is_solved_near_the_posture_that_a_plan_would_take(model: str, planned: bool) -> None:
-    """Before, near where the arm stood, so that the controller chose the side of the wrist."""
-    robot: Any = SimpleNamespace(
-        state=lambda: SimpleNamespace(sample=SimpleNamespace(joints_rad=BEFORE_RAD)),
-        report=lambda: SimpleNamespace(identity=SimpleNamespace(model=model)),
-    )
-    context: Any = SimpleNamespace(devices=SimpleNamespace(surroundings=lambda: (CollisionSection(), None)))
-    T = forward(ARM, TURNED_OVER_RAD[None])[0]
-    near = nearest_posture(ARM, T, BEFORE_RAD)
-    assert near is not None
-    assert np.array_equal(posture_without_plan(context, robot, T), near if planned else BEFORE_RAD)
 
 
 def test_the_nearest_posture_turns_no_joint_by_a_needless_revolution() -> None:
