@@ -129,7 +129,9 @@ def plan_motion(
             vain += 0 if len(round_about.way_rad) else _ROUND_POSTURES
             able[i], blocked = round_about, "" if len(round_about.way_rad) else blocked
         if blocked:
-            refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
+            stands = scene.freedom.obstruction(here[None])
+            reason = f"where the arm stands, {stands}: move it clear by its pendant" if stands else ""
+            refused.append(replace(able[i], outcome="refused", reason=reason or f"on the way there {blocked}"))
             continue
         legs = [*able[i].way_rad, able[i].joints_rad] if len(able[i].way_rad) else [here, able[i].joints_rad]
         travel_s = float(_legs_s(np.stack(legs), scene).sum())
