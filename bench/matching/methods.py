@@ -12,9 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from service.benchmark.matching.result import record
-from service.benchmark.matching.running import MatchingTask, run_matching
-from service.benchmark.matching.table import markdown
+from service.benchmark.matching import MatchingTask, run_matching
+from service.benchmark.matching_results import markdown, record
 from service.compute.matching.methods.method import matcher
 
 _WORK = REPOSITORY / "build" / "bench" / "matching"

@@ -19,11 +19,18 @@ from service.core.records.events import OperatorAction, SessionStarted
 from service.core.records.moments import elapsed
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.monitor.devices import OpenDevices
-from service.monitor.health import read_health
-from service.monitor.reporter import Reporter
-from service.monitor.snapshot import STALE_S, ask_for_frames, frame_path, frames_wanted, read_snapshot, write_frame
-from service.monitor.worker_sign import SignOfLife, living_workers
+from service.monitor.figures import read_health
+from service.monitor.reporter import OpenDevices, Reporter
+from service.monitor.snapshot import (
+    STALE_S,
+    SignOfLife,
+    ask_for_frames,
+    frame_path,
+    frames_wanted,
+    living_workers,
+    read_snapshot,
+    write_frame,
+)
 from service.steps.capture.held_camera import new_images
 from service.steps.context import StepContext
 from service.store.database.tables import jobs, leases

@@ -19,7 +19,7 @@ from bench.machine import REPOSITORY
 from bench.pages.retold import retell
 from service.core.gates.verdict import evaluate_gates
 from service.core.records.events import ItemTicked, OperatorAction, RecordCorrected, ViewpointCaptured
-from service.people.roles import Role
+from service.people.person import Role
 from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import recorded_run

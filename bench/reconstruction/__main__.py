@@ -16,11 +16,10 @@ from pathlib import Path
 from bench.machine import REPOSITORY, RESULTS
 from bench.reconstruction.simulated import simulated_data_set
 from bench.scenes import CACHE, render_scene
-from service.benchmark.figure import figure_png
-from service.benchmark.method import method_named, methods
+from service.benchmark.methods import method_named, methods
 from service.benchmark.records import SCENARIOS, read_results
 from service.benchmark.running import Trial, run_trial
-from service.benchmark.table import table_markdown
+from service.benchmark.table import figure_png, table_markdown
 
 WORK = REPOSITORY / "build" / "bench" / "reconstruction"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import get_args
 
-from service.people.roles import ROLES, Permission, may
+from service.people.person import ROLES, Permission, may
 
 _MEANINGS = {
     "read": "every page of every run, the audit's included",

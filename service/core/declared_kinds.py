@@ -1,4 +1,4 @@
-"""Kinds that are declared once, as KIND in a module of their own: those of a package, and those of plug-ins."""
+"""Kinds that are declared once, as KIND or in KINDS of a module: those of a package, and those of plug-ins."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ K = TypeVar("K", bound=DeclaredKind)
 
 
 def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
-    """The kinds of this type by name: of every module below `package` that defines KIND, and of entry points.
+    """The kinds of this type by name: KIND or KINDS of every module below `package`, and those of entry points.
 
     Args:
-        package: name of the package, at any depth of which modules are looked for.
+        package: name of the package, at any depth of which modules are looked for, or of one module.
         group: of the entry points, each of which names a kind.
         kind: the type of what is declared.
 
@@ -39,6 +39,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
     """
     modules = [importlib.import_module(name) for name in _modules(package)]
     declared: list[object] = [module.KIND for module in modules if hasattr(module, "KIND")]
+    declared += [kind for module in modules for kind in getattr(module, "KINDS", ())]
     declared += [point.load() for point in plug_ins(group)]
     kinds: dict[str, K] = {}
     for one in declared:
@@ -63,7 +64,9 @@ def _plug_ins(_path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
 
 
 def _modules(package: str) -> list[str]:
-    path = importlib.import_module(package).__path__
+    path = getattr(importlib.import_module(package), "__path__", None)
+    if path is None:
+        return [package]
     return [found.name for found in pkgutil.walk_packages(path, f"{package}.") if not found.ispkg]
 
 

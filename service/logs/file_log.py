@@ -1,19 +1,28 @@
-"""Writes a process's log records to the data folder as JSON too; the terminal's output stays as it is."""
+"""Writes a process's log records to the data folder as JSON too; the terminal's output stays as it is.
+
+The file is rotated by size and bounded in total, secrets are removed from its lines, and each line says what the
+process worked on when it was written.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import logging
-from collections.abc import Callable, Generator
+import os
+import re
+import shutil
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from os import getpid
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-import structlog
-from structlog.typing import EventDict, WrappedLogger
+from service.core.equipment.disk_space import LEAST_FREE_BYTES
+from service.core.units import gigabytes
 
-from service.logs.bounded_file import BoundedFile
-from service.logs.secrets import without_secrets
-from service.logs.where import at, where_now
+if TYPE_CHECKING:
+    from structlog.typing import EventDict, WrappedLogger
 
 _LONGEST = 20_000  # characters of one text: the traceback of a deep recursion must not rotate the whole log away
 _OURS = ("service", "drivers", "orthocapture")  # other libraries log too much below warnings
@@ -68,6 +77,8 @@ def file_log(
 
 
 def _formatter(process: str) -> logging.Formatter:
+    import structlog  # noqa: PLC0415 - steps that say where they work need no log
+
     def place(_logger: WrappedLogger, _method: str, line: EventDict) -> EventDict:
         name = str(line.get("logger", ""))
         child = name.removeprefix(_CHILDREN) if name.startswith(_CHILDREN) else ""
@@ -101,3 +112,148 @@ def _shortened(_logger: WrappedLogger, _method: str, line: EventDict) -> EventDi
 
 def _scrubbed(_logger: WrappedLogger, _method: str, line: EventDict) -> EventDict:
     return {name: without_secrets(value, name) for name, value in line.items()}
+
+
+NAME = "orthocapture.jsonl"
+FILE_BYTES = 10_000_000
+FILES = 10  # the current file and the older ones: 100 MB in total
+_STOPPED = "less than {:.1f} GB are free: logging stops until there is more; the evidence is still recorded"
+_GOES_ON = "logging resumes: there is space again"
+
+
+class BoundedFile(logging.Handler):
+    """Writes lines to DATA/logs/orthocapture.jsonl; older ones move to orthocapture.1.jsonl, .2 …, then go.
+
+    A failure here never disturbs the process that logs: a line that cannot be written is lost.
+    """
+
+    def __init__(
+        self,
+        data: Path,
+        *,
+        file_bytes: int = FILE_BYTES,
+        files: int = FILES,
+        free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
+    ) -> None:
+        super().__init__(logging.INFO)
+        self._data = data
+        self._file_bytes, self._files = file_bytes, files
+        self._free_bytes = free_bytes
+        self._stream: BinaryIO | None = None
+        self._stopped = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record as a line; rotate the files first if it does not fit. `logging.Handler` holds its lock."""
+        if not self._data.is_dir():
+            return  # no data folder yet, and a log must not create one
+        with contextlib.suppress(OSError):
+            full = self._free_bytes(self._data) < LEAST_FREE_BYTES
+            if full and self._stopped:
+                return
+            if full != self._stopped:
+                self._write(self._line(record, _STOPPED.format(gigabytes(LEAST_FREE_BYTES)) if full else _GOES_ON))
+                self._stopped = full
+            if not full:
+                self._write(self._line(record))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+        super().close()
+
+    def _line(self, record: logging.LogRecord, instead: str = "") -> bytes:
+        if instead:
+            record = logging.LogRecord(__name__, logging.WARNING, __file__, 0, instead, None, None)
+        return self.format(record).encode(errors="backslashreplace") + b"\n"
+
+    def _write(self, line: bytes) -> None:
+        folder = self._data / "logs"
+        folder.mkdir(exist_ok=True)
+        with _locked(folder / ".lock"):
+            path = folder / NAME
+            if self._stream is not None and not _is(self._stream, path):  # another process has rotated
+                self._stream.close()
+                self._stream = None
+            if self._stream is None:
+                self._stream = path.open("ab", buffering=0)
+            size = os.fstat(self._stream.fileno()).st_size  # other processes append too
+            if size and size + len(line) > self._file_bytes:
+                self._stream.close()
+                self._rotate(path)
+                self._stream = path.open("ab", buffering=0)
+            self._stream.write(line)
+
+    def _rotate(self, path: Path) -> None:
+        for number in range(self._files - 1, 0, -1):
+            older = path.with_suffix(f".{number}.jsonl")
+            newer = path if number == 1 else path.with_suffix(f".{number - 1}.jsonl")
+            if newer.exists():
+                newer.replace(older)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Generator[None]:
+    with path.open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _is(stream: BinaryIO, path: Path) -> bool:
+    with contextlib.suppress(FileNotFoundError):
+        here, there = os.fstat(stream.fileno()), path.stat()
+        return (here.st_dev, here.st_ino) == (there.st_dev, there.st_ino)
+    return False
+
+
+OUT = "[secret]"
+_NAMES = r"pass(?:word|phrase|wd)?|pin|token|csrf|secret|authorization|cookie|api[_-]?key|private[_-]?key|session"
+_NAME = re.compile(rf"(?:\w*_)?(?:{_NAMES})(?:_hash|_sha256)?", re.IGNORECASE)
+_PATTERNS = (
+    (re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL), OUT),
+    (re.compile(r"(/set-up/)[^\s\"'<>/?#{]+"), rf"\1{OUT}"),
+    (re.compile(r"(://)[^/\s:@]+:[^/\s@]+@"), rf"\1{OUT}@"),
+    (re.compile(r"\$argon2\S+"), OUT),
+    # Authorization: Bearer abc; Cookie: a=b; c=d
+    (re.compile(r"\b(authorization|(?:set-)?cookie)(\s*[:=]\s*)[^\r\n]+", re.IGNORECASE), rf"\1\2{OUT}"),
+    (
+        re.compile(rf"\b((?:\w*_)?(?:{_NAMES}))(['\"]?\s*[=:]\s*)(\"[^\"]*\"|'[^']*'|[^\s,;&)}}\]]+)", re.IGNORECASE),
+        rf"\1\2{OUT}",
+    ),
+)
+
+
+def without_secrets(value: Any, name: str = "") -> Any:
+    """A copy of plain data with secrets replaced by `[secret]`, found by field name and by pattern within text."""
+    if name and _NAME.fullmatch(name) and value not in (None, "", False, True):
+        return OUT
+    if isinstance(value, str):
+        for pattern, instead in _PATTERNS:
+            value = pattern.sub(instead, value)
+        return value
+    if isinstance(value, Mapping):
+        return {str(key): without_secrets(item, str(key)) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_secrets(item) for item in value]
+    return value
+
+
+# What this process works on now (run, step, viewpoint), added to every log line whichever thread writes it.
+#
+# It belongs to the process, not to a thread: one process drives one run or computes one job, and its drivers answer
+# in threads of their own.
+
+
+_now: Mapping[str, str] = {}
+
+
+def at(**names: str) -> None:
+    """Set names for all later lines, as in `at(step="capture", viewpoint="v1_003")`; "" removes a name."""
+    global _now  # noqa: PLW0603 - one per process (see above); replaced as a whole, so no thread sees half of it
+    _now = {name: value for name, value in {**_now, **names}.items() if value}
+
+
+def where_now() -> Mapping[str, str]:
+    """The names that are set now."""
+    return _now

@@ -1,24 +1,32 @@
-"""The operating figures of a data folder, read from the record and from what processes report."""
+"""Reads the operating figures of a data folder and its health from the record and from what processes report."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 
 from pydantic import BaseModel
-from sqlalchemy import Connection, case, func, select
+from sqlalchemy import Connection, case, func, select, text
 
+from service.core.equipment.disk_space import LEAST_FREE_BYTES
+from service.core.errors import OrthocaptureError
 from service.core.jobs.priorities import EARLY
-from service.monitor.snapshot import Doing, RobotPhase, read_snapshot
-from service.monitor.worker_sign import living_workers
+from service.core.records.events import RunStarted
+from service.core.run.expected import EarlierTimes
+from service.core.units import gigabytes
+from service.monitor.snapshot import Doing, RobotPhase, living_workers, read_snapshot
 from service.store.database.tables import event_index, events, jobs, runs
+from service.store.durable_effects import Clock
 from service.store.events import parse_canonical
 from service.store.records import SITE
 from service.store.run_rows import read_open_runs
+from service.store.signatures.second_place import Away
 from service.store.store import Store
 
 CAPTURED = ("viewpoint_captured", "view_held", "view_imported")
@@ -163,8 +171,8 @@ def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
         .order_by(event_index.c.seq)
     )
     devices: dict[str, DeviceFigures] = {}
-    for text in connection.execute(found).scalars():
-        event = _DeviceEvent.model_validate(parse_canonical(text))
+    for payload in connection.execute(found).scalars():
+        event = _DeviceEvent.model_validate(parse_canonical(payload))
         known = devices.get(event.device)
         if event.kind == "device_opened":
             report = event.report
@@ -180,3 +188,110 @@ def _database_bytes(path: Path) -> int:
     """Size including the write-ahead log."""
     parts = (path, path.with_name(path.name + "-wal"))
     return sum(part.stat().st_size for part in parts if part.exists())
+
+
+_SILENT_S = 60.0  # a runner's longest call, fetching one photograph, is shorter
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What is wrong with each part; "" if nothing is."""
+
+    database: str
+    data_folder: str
+    worker: str
+    runners: str
+    second_place: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not (self.database or self.data_folder or self.worker or self.runners or self.second_place)
+
+
+def read_health(store: Store, data: Path, driven: Sequence[str], away: Away | None = None) -> Health:
+    """Check every part. The words name no runs, people or paths, because anyone may ask.
+
+    `away` is what is known of the second place of the signatures.
+    """
+    try:
+        with store.database.reading() as connection:
+            connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
+        store.database.require_record()
+        database, queued = "", store.open_jobs()
+    except OrthocaptureError as error:
+        database, queued = error.what, 0
+    return Health(
+        database,
+        _data_folder(data),
+        _worker(data, queued, store.clock),
+        _runners(data, driven, store.clock.utc_s()),
+        "" if away is None else f"it has not been up to date since {away.since_utc}",
+    )
+
+
+def _data_folder(data: Path) -> str:
+    try:
+        free = shutil.disk_usage(data).free
+    except OSError as error:
+        return f"it cannot be reached: {error.strerror}"
+    if not os.access(data / "artefacts", os.W_OK):
+        return "it cannot be written to"
+    if free >= LEAST_FREE_BYTES:
+        return ""
+    kept = f"the last {gigabytes(LEAST_FREE_BYTES):.2f} GB are kept for what is under way"
+    return f"{gigabytes(free):.2f} GB are free: too little to capture; {kept}"
+
+
+def _worker(data: Path, queued: int, clock: Clock) -> str:
+    if not queued or living_workers(data, clock):
+        return ""
+    waiting = "a job waits" if queued == 1 else f"{queued} jobs wait"
+    return f"{waiting}, and no worker is running"
+
+
+def _runners(data: Path, driven: Sequence[str], now_utc_s: float) -> str:
+    snapshots = [read_snapshot(data, run_id, now_utc_s) for run_id in driven]
+    silent = [shot for shot in snapshots if shot.at_utc_s and shot.unattended_s(now_utc_s) > _SILENT_S]
+    return f"{len(silent)} of {len(driven)} runners have not reported for {_SILENT_S:.0f} s" if silent else ""
+
+
+_RUNS = 10  # earlier runs that are looked at, the latest ones
+_BEGINS, _ENDS = ("step_started", "step_retried"), "step_measured"
+# A person paused the work or had a part of it done again: such an attempt does not tell how long it takes.
+_INTERRUPTS = ("operator_action", "leave_lapsed")
+
+
+def read_step_times(store: Store, run_id: str) -> EarlierTimes:
+    """Seconds from the beginning of each step's work to its figures, in the earlier runs of the run's protocol.
+
+    Runs of a simulated rig tell nothing of a real one, nor the other way round. Raises StoreError.
+    """
+    mine = store.first_event(run_id).payload
+    assert isinstance(mine, RunStarted)  # checked when the run was read
+    names = [row.run_id for row in store.runs() if row.simulated == mine.simulated]
+    before = names[: names.index(run_id)] if run_id in names else names
+    earlier: list[str] = []
+    for name in reversed(before):
+        root = store.first_event(name).payload
+        if isinstance(root, RunStarted) and (root.protocol_id, root.origin) == (mine.protocol_id, mine.origin):
+            earlier.append(name)
+        if len(earlier) == _RUNS:
+            break
+    times: dict[str, list[float]] = {}
+    began: dict[str, datetime] = {}
+    of_event = (events.c.run_id == event_index.c.run_id) & (events.c.seq == event_index.c.seq)
+    found = (
+        select(event_index.c.run_id, event_index.c.kind, event_index.c.step, events.c.at_utc)
+        .join(events, of_event)
+        .where(event_index.c.run_id.in_(earlier), event_index.c.kind.in_((*_BEGINS, _ENDS, *_INTERRUPTS)))
+        .order_by(event_index.c.position)
+    )
+    with store.database.reading() as connection:
+        for row in connection.execute(found):
+            at = datetime.fromisoformat(row.at_utc)
+            if row.kind in _BEGINS:
+                began[row.run_id] = at
+            elif (since := began.pop(row.run_id, None)) is not None and row.kind == _ENDS and at >= since:
+                times.setdefault(row.step, []).append((at - since).total_seconds())
+    return times

@@ -11,10 +11,10 @@ from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.core.text.person_names import cleaned_name, person_name
-from service.people.credentials.tries import TERMINAL, SecretOrigin
-from service.people.errors import NotAllowedError
-from service.people.names import plain_name
+from service.people.person import NotAllowedError
+from service.people.rows import plain_name
 from service.people.sessions import KnownBy, People
+from service.people.tries import TERMINAL, SecretOrigin
 
 
 @dataclass(frozen=True, slots=True)

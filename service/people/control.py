@@ -13,8 +13,7 @@ from sqlalchemy.dialects.sqlite import insert
 from service.core.records.events import ControlTaken
 from service.core.records.moments import age_s
 from service.core.text.reasons import reason_of
-from service.people.errors import AccountError, ControlError, NotAllowedError
-from service.people.person import Person
+from service.people.person import AccountError, ControlError, NotAllowedError, Person
 from service.people.rows import SESSION_S
 from service.store.database.tables import accounts, control, runs, sessions
 from service.store.store import Store

@@ -13,11 +13,29 @@ from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from service.core.records.events import AccountChanged, SignInRecorded
 from service.core.records.moments import age_s
-from service.people.accounts import Accounts
-from service.people.credentials.badges import Badges
-from service.people.credentials.passwords import Passwords, ShortSecrets, new_token, token_sha256
-from service.people.credentials.pepper import Pepper
-from service.people.credentials.tries import (
+from service.people.accounts import Accounts, Badges
+from service.people.credentials import Passwords, Pepper, ShortSecrets, new_token, token_sha256
+from service.people.person import (
+    AccountError,
+    AccountJustChangedError,
+    NotSignedInError,
+    Person,
+    PinRefusedError,
+    Screen,
+    SignInRefusedError,
+)
+from service.people.rows import (
+    SERVICE,
+    SESSION_S,
+    find_account,
+    get_account,
+    plain_name,
+    record_change,
+    record_sign_in,
+    to_account,
+    to_person,
+)
+from service.people.tries import (
     FIRST_WAIT_S,
     FREE_FAILURES,
     LONGEST_WAIT_S,
@@ -25,25 +43,6 @@ from service.people.credentials.tries import (
     KnownTries,
     SecretOrigin,
     wait_after_s,
-)
-from service.people.errors import (
-    AccountError,
-    AccountJustChangedError,
-    NotSignedInError,
-    PinRefusedError,
-    SignInRefusedError,
-)
-from service.people.names import plain_name
-from service.people.person import Person, Screen
-from service.people.rows import (
-    SERVICE,
-    SESSION_S,
-    find_account,
-    get_account,
-    record_change,
-    record_sign_in,
-    to_account,
-    to_person,
 )
 from service.store.database.tables import accounts, sessions
 from service.store.store import Store

@@ -19,8 +19,8 @@ from service.core.records.events import DeviceTrouble, Payload, StepFailed, Step
 from service.core.recovery.policy import TRIED_AGAIN, recovery_policy
 from service.core.run.state import JobState
 from service.core.text.counts import counted
-from service.logs.where import at
-from service.monitor.worker_sign import living_workers
+from service.logs.file_log import at
+from service.monitor.snapshot import living_workers
 from service.run_record import StepEvidence
 from service.runner.disk import DiskWatch
 from service.runner.held_run import HeldRun

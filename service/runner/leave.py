@@ -13,8 +13,8 @@ from service.core.records.events import LeaveLapsed
 from service.core.records.moments import Moment, elapsed
 from service.core.run.state import Leave, RunState
 from service.core.run.tries import failed_words
-from service.monitor.processor import processor_s
-from service.monitor.worker_sign import living_workers
+from service.monitor.host import processor_s
+from service.monitor.snapshot import living_workers
 from service.runner.held_run import HeldRun
 from service.steps.context import StepInterruptedError
 from service.store.durable_effects import Clock, moment_of

@@ -42,7 +42,7 @@ from service.core.run.decide import (
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.core.run.tries import tries_words
-from service.monitor.host_clock import host_clock
+from service.monitor.host import host_clock
 from service.runner.clocks import ClockWatch
 from service.runner.disk import DiskWatch
 from service.runner.execution import Starvation, StepExecution, WorkerWatch, held_up_here

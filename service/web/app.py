@@ -14,7 +14,7 @@ import service.web.monitoring.pages
 import service.web.run.pages
 import service.web.scene.pages
 import service.web.scene.region
-from service.people.credentials.tries import failed_tries
+from service.people.tries import failed_tries
 from service.web.audit import corrections, devices, exports, gates, overview, runs, signatures
 from service.web.capture import media
 from service.web.evidence import artefacts, events

@@ -78,7 +78,7 @@ class Site:
     def step_times(self, run_id: str) -> EarlierTimes:
         """How long the steps took in the runs before this one; read once. Raises UnknownRunError, StoreError."""
         if run_id not in self._step_times:
-            from service.monitor.step_times import read_step_times  # noqa: PLC0415 - of runs under way only
+            from service.monitor.figures import read_step_times  # noqa: PLC0415 - of runs under way only
 
             self._step_times[run_id] = read_step_times(self.store, run_id)
         return self._step_times[run_id]

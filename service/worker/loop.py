@@ -22,7 +22,7 @@ from service.jobs import job_kinds
 from service.jobs.kind import Demand
 from service.jobs.memory_grants import MemoryGrants
 from service.jobs.words import term
-from service.logs.where import at
+from service.logs.file_log import at
 from service.store.errors import LeaseLostError
 from service.store.records import Job
 from service.store.store import Store

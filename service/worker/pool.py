@@ -26,7 +26,7 @@ from service.compute.priority import compute_in_background
 from service.core.jobs.priorities import Lane
 from service.logs.file_log import file_log
 from service.logs.terminal import show_own_words_only
-from service.monitor.worker_sign import SignOfLife
+from service.monitor.snapshot import SignOfLife
 from service.store.store import Store
 from service.worker.loop import work
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.benchmark.commands import run_commands
+from service.benchmark.running import run_commands
 from service.core.errors import ComputeError, ConfigurationError
 
 HELD = 300 << 20

@@ -9,9 +9,8 @@ import pycolmap
 import pytest
 
 from drivers.meshes.surface_file import read_surface_file
-from service.benchmark.method import methods, missing
-from service.benchmark.programs.patch_match import reconstruct
-from service.benchmark.programs.triangulated import triangulate
+from service.benchmark.methods import methods, missing
+from service.benchmark.programs.colmap import reconstruct, triangulate
 from service.compute.pixels.ray_mesh import RayMesh
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.benchmark.figure import figure_png
-from service.benchmark.method import Workplace, methods, missing
+from service.benchmark.methods import Workplace, methods, missing
 from service.benchmark.records import BenchmarkResult, read_results
 from service.benchmark.running import Trial, run_trial
-from service.benchmark.table import table_markdown, table_record
+from service.benchmark.table import figure_png, table_markdown, table_record
 from service.compute.ground_truth.distances.chamfer import ChamferSettings
 from service.core.errors import ComputeError, ConfigurationError, DataError, OrthocaptureError
 from service.core.geometry import apply, inverse
@@ -30,7 +29,7 @@ from tests.support.scenes.posed import posed_data_set, scene
 
 COARSE = ChamferSettings(spacing_m=1e-3)
 PLACE = Workplace(Path("/d"), Path("/w"), Path("/c"), "python")
-TRIANGULATED = "python -m service.benchmark.programs.triangulated /d /w/dense"
+TRIANGULATED = "python -m service.benchmark.programs.colmap triangulate /d /w/dense"
 COMMANDS = {
     "colmap": [
         TRIANGULATED,
@@ -42,7 +41,7 @@ COMMANDS = {
     ],
     "pycolmap": [
         TRIANGULATED,
-        "python -m service.benchmark.programs.patch_match /w/dense /w/fused.ply /w/mesh.ply",
+        "python -m service.benchmark.programs.colmap patch_match /w/dense /w/fused.ply /w/mesh.ply",
     ],
     "openmvs": [
         TRIANGULATED,

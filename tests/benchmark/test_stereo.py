@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.benchmark.method import methods, missing
+from service.benchmark.methods import methods, missing
 from service.benchmark.running import Trial, run_trial
 from service.compute.camera_model import CameraModel
 from service.compute.ground_truth.distances.chamfer import ChamferSettings

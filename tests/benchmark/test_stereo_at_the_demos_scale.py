@@ -8,7 +8,7 @@ import pytest
 
 from bench.reconstruction.simulated import simulated_data_set
 from bench.scenes import render_scene
-from service.benchmark.method import methods
+from service.benchmark.methods import methods
 from service.benchmark.running import Trial, run_trial
 from service.compute.ground_truth.distances.chamfer import ChamferSettings
 

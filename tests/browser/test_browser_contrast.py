@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, CDPSession, Page, Route
 
-from service.people.roles import Role
+from service.people.person import Role
 from tests.support.pages.browser import TABLET
 from tests.support.pages.states import (
     Seen,

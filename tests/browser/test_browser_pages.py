@@ -14,7 +14,7 @@ from fastapi.routing import iter_route_contexts
 from playwright.sync_api import Browser, Page, Route, expect
 
 from service.core.records.events import OperatorAction
-from service.people.roles import Role
+from service.people.person import Role
 from service.store.store import Store
 from tests.support.pages.browser import (
     DESKTOP,

@@ -17,7 +17,7 @@ import pytest
 from rich.table import Table
 from typer.testing import CliRunner
 
-from service.benchmark.method import methods
+from service.benchmark.methods import methods
 from service.cli.common import print_table
 from service.cli.main import app
 from service.cli.run.demo import free_address

@@ -9,7 +9,7 @@ import pytest
 
 from service.core.records.events import LeaveLapsed, StepMeasured
 from service.core.run.expected import away_words, run_words, step_words, work_words
-from service.monitor.step_times import read_step_times
+from service.monitor.figures import read_step_times
 from tests.support.record.core import GOOD, TOY, Log, toy_protocol
 from tests.support.record.core_log import at_capture, at_scan
 from tests.support.runs.bench_fixtures import begin

@@ -43,7 +43,7 @@ EDGES = {
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
     "service/compute/poses/files/camera_files.py": "reads JSON files",
     "service/core/protocol/models.py": "the JSON schema of a protocol",
-    "service/benchmark/matching/result.py": "writes a result of the benchmark of matching",
+    "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",
     "service/dataset/package/crate.py": "writes ro-crate-metadata.json",
     "service/dataset/package/croissant.py": "writes croissant.json",

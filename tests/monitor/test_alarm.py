@@ -15,8 +15,7 @@ import pytest
 
 from service.core.errors import ConfigurationError
 from service.monitor.alarm import Alarm
-from service.monitor.devices import OpenDevices
-from service.monitor.reporter import Reporter
+from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import AlertsSection, load_rig
 from tests.support.processes.waiting import until
 from tests.support.record.stepped_clock import SteppedClock

@@ -12,7 +12,7 @@ import pytest
 from drivers.interfaces import DeviceReport
 from service.core.equipment.clocks import ClockReading, clock_readings
 from service.core.records.events import DeviceOpened, HostClock, Payload, SessionStarted
-from service.monitor.host_clock import host_clock
+from service.monitor.host import host_clock
 from service.store.records import NewArtefact
 from service.store.store import Store
 from tests.support.pages.web import web_site

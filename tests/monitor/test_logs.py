@@ -15,9 +15,7 @@ import httpx
 import pytest
 
 from drivers.host.hosted_device import hosted
-from service.logs.bounded_file import NAME, BoundedFile
-from service.logs.file_log import file_log
-from service.logs.secrets import without_secrets
+from service.logs.file_log import NAME, BoundedFile, file_log, without_secrets
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker.loop import work
@@ -134,7 +132,7 @@ def test_an_error_that_nobody_foresaw_comes_with_its_traceback_on_one_line(tmp_p
 _WRITER = """
 import logging, sys
 from pathlib import Path
-from service.logs.bounded_file import BoundedFile
+from service.logs.file_log import BoundedFile
 from service.logs.file_log import file_log
 data = Path(sys.argv[1])
 with file_log(data, sys.argv[2], handler=BoundedFile(data, file_bytes=20_000, files=4)):

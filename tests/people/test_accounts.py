@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.people.errors import AccountError, LinkError, SignInRefusedError
-from service.people.roles import ROLES, may
+from service.people.person import ROLES, AccountError, LinkError, SignInRefusedError, may
 from service.people.sessions import People
 from service.store.database.engine import database_path
 from service.store.records import SITE

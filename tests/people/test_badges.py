@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from service.core.records.events import AccountChanged, OperatorAction
-from service.people.credentials.tries import FREE_FAILURES
-from service.people.errors import AccountError, SignInRefusedError
-from service.people.roles import Role
+from service.people.person import AccountError, Role, SignInRefusedError
 from service.people.sessions import KnownBy
+from service.people.tries import FREE_FAILURES
 from service.rig import load_rig
 from service.store.database.engine import database_path
 from service.store.records import SITE

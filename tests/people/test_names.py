@@ -15,7 +15,7 @@ from service.audit.verify.verifications import Verifications
 from service.cli.main import app
 from service.core.errors import ConfigurationError
 from service.core.text.person_names import NAME_CHARACTERS, cleaned_name, looks_of, person_name
-from service.people.errors import AccountError
+from service.people.person import AccountError
 from service.people.sessions import People
 from service.store.records import SITE
 from service.store.store import Store

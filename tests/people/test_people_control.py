@@ -10,8 +10,7 @@ import pytest
 
 from service.core.records.events import ControlTaken
 from service.people.control import Control
-from service.people.errors import AccountError, ControlError, NotAllowedError
-from service.people.person import Person
+from service.people.person import AccountError, ControlError, NotAllowedError, Person
 from service.people.sessions import People
 from service.store.errors import UnknownRunError
 from service.store.store import Store

@@ -10,7 +10,7 @@ import pytest
 from argon2 import PasswordHasher
 from argon2.exceptions import VerifyMismatchError
 
-from service.people.errors import PinRefusedError
+from service.people.person import PinRefusedError
 from service.people.sessions import People
 from service.store.backup.backup import BackupOptions, back_up
 from service.store.backup.restore import restore

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from sqlalchemy import Connection
 
 from service.core.records.events import ServiceStarted, SignInRecorded
-from service.people.credentials.tries import failed_tries, wait_after_s
-from service.people.errors import NotSignedInError, PinRefusedError
+from service.people.person import NotSignedInError, PinRefusedError
 from service.people.sessions import People
+from service.people.tries import failed_tries, wait_after_s
 from service.store.database.engine import Database, database_path
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused

@@ -12,10 +12,9 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.records.events import AccountChanged, SignInRecorded
-from service.people.credentials.tries import FREE_FAILURES, SecretOrigin, on_screen_of
-from service.people.errors import SignInRefusedError
-from service.people.person import Person
+from service.people.person import Person, SignInRefusedError
 from service.people.sessions import KnownBy, People
+from service.people.tries import FREE_FAILURES, SecretOrigin, on_screen_of
 from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.verification.verify import verify

@@ -27,8 +27,7 @@ from service.core.run.actions import allowed_actions, unmet_requirements
 from service.core.run.decide import AskOperator
 from service.core.run.fold import fold
 from service.core.run.state import RunState
-from service.monitor.devices import OpenDevices
-from service.monitor.reporter import Reporter
+from service.monitor.reporter import OpenDevices, Reporter
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
 from service.steps import params_models

@@ -12,7 +12,7 @@ from service.core.records.events import LeaveLapsed, OperatorAction, StepFailed,
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.core.run.tries import tries_words
-from service.monitor.worker_sign import SignOfLife
+from service.monitor.snapshot import SignOfLife
 from service.runner import leave
 from service.runner.held_run import held_run
 from service.runner.leave import LeaveWatch

@@ -20,7 +20,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.jobs.calibration import board_view, calibrate
 from service.jobs.records import Camera
-from service.monitor.worker_sign import SignOfLife
+from service.monitor.snapshot import SignOfLife
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, KilledError
 

@@ -20,8 +20,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import OperatorAction, StepNote
 from service.core.run.state import RunState
-from service.monitor.devices import OpenDevices
-from service.monitor.reporter import Reporter
+from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
 from service.runner.loop import Runner

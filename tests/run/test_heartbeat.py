@@ -13,8 +13,7 @@ import pytest
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotArm, RobotSample, SafetyState
 from service.core.run.state import RunState
-from service.monitor.devices import OpenDevices
-from service.monitor.reporter import Reporter
+from service.monitor.reporter import OpenDevices, Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
 from service.web.page.robot_banner import Banner, robot_banner
 from tests.support.pages.web import web_site

@@ -18,8 +18,7 @@ from service.core.errors import PersonNeededError
 from service.core.records.events import OperatorAction, StepFailed
 from service.core.run.decide import AskOperator
 from service.core.text.reasons import REASON_CHARACTERS
-from service.monitor.devices import OpenDevices
-from service.monitor.reporter import Reporter
+from service.monitor.reporter import OpenDevices, Reporter
 from service.store.store import Store
 from tests.support.record.core import Log, toy_protocol
 from tests.support.rig.bench_rig import BenchCamera

@@ -12,7 +12,7 @@ from urllib.parse import urljoin, urlsplit
 import httpx
 import pytest
 
-from service.people.roles import ROLES, Role, may
+from service.people.person import ROLES, Role, may
 from tests.support.pages.shown_site import ShownSite, shown_site
 from tests.support.pages.web import HOST, PIN, Browser, WebSite, password_of, web_site
 

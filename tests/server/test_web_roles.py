@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute, iter_route_contexts
 from starlette.routing import Route
 
-from service.people.roles import ROLES, Permission, Role, may
+from service.people.person import ROLES, Permission, Role, may
 from service.store.records import SITE
 from service.web.security.guards import Guard
 from tests.support.pages.web import Browser, WebSite, web_site

@@ -18,7 +18,7 @@ from schemathesis.checks import not_a_server_error
 from schemathesis.core.result import Ok
 from schemathesis.schemas import APIOperation
 
-from service.people.roles import ROLES, Role, may
+from service.people.person import ROLES, Role, may
 from service.web.security.shield import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
 from tests.support.pages.web import HOST, PIN, Browser, WebSite, web_site
 

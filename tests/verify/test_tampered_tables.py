@@ -11,9 +11,8 @@ import pytest
 
 from service.core.errors import StoreError
 from service.core.records.events import StepNote
-from service.people.credentials.passwords import token_sha256
-from service.people.errors import LinkError, NotSignedInError, PinRefusedError, SignInRefusedError
-from service.people.person import Person
+from service.people.credentials import token_sha256
+from service.people.person import LinkError, NotSignedInError, Person, PinRefusedError, SignInRefusedError
 from service.people.sessions import People
 from service.store.database.engine import database_path
 from service.store.records import SITE, NewArtefact, NewJob

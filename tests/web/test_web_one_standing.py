@@ -14,7 +14,7 @@ import pytest
 from service.core.records.events import FilesKept, OperatorAction, RecordedView
 from service.core.recovery.ways_on import ways_on
 from service.monitor.snapshot import RobotPhase, Snapshot, write_snapshot
-from service.people.roles import ROLES, Role, may
+from service.people.person import ROLES, Role, may
 from service.web.page.run_standing import RunStanding, run_standing
 from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import ShownSite, shown_site

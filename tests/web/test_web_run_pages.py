@@ -19,7 +19,7 @@ from service.core.records.events import (
     StepStarted,
 )
 from service.monitor.snapshot import Message, Snapshot, write_snapshot
-from service.people.roles import ROLES, Role
+from service.people.person import ROLES, Role
 from service.store.records import NewJob
 from tests.support.pages.web import WebSite, web_site
 

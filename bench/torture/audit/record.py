@@ -15,8 +15,7 @@ from service.audit.record.starts import record_start
 from service.core.errors import DataError
 from service.core.records.events import EvidenceExported, OperatorAction, RunAborted, RunReleased
 from service.people.control import Control
-from service.people.errors import SignInRefusedError
-from service.people.person import Person
+from service.people.person import Person, SignInRefusedError
 from service.people.sessions import People
 from service.rig import load_rig
 from service.store.database.engine import database_path

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from service.benchmark.programs.exported_views import views_of
+from service.benchmark.programs.colmap import views_of
 from service.compute.ground_truth.ply import write_ply
 from service.compute.images.files import read_image
 from service.compute.poses.files.pose_files import HALF_PIXEL

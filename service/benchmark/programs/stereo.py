@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 
-from service.benchmark.programs.exported_views import views_of
+from service.benchmark.programs.colmap import views_of
 from service.compute.ground_truth.ply import write_ply
 from service.compute.memory import keep_freed_memory
 from service.compute.stereo.reconstruct import reconstruct

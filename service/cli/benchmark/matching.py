@@ -40,9 +40,12 @@ def matching_command(
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         # These load the numerics, which take seconds.
-        from service.benchmark.matching.result import record  # noqa: PLC0415
-        from service.benchmark.matching.running import MatchingTask, run_matching  # noqa: PLC0415
-        from service.benchmark.matching.table import HEADER, rows  # noqa: PLC0415
+        from service.benchmark.matching import MatchingTask, run_matching  # noqa: PLC0415
+        from service.benchmark.matching_results import (  # noqa: PLC0415
+            HEADER,
+            record,
+            rows,
+        )
         from service.compute.matching.methods.method import matcher  # noqa: PLC0415
 
         how = matcher(method)

@@ -57,7 +57,7 @@ def run_command(
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         # These load the numerics, which take seconds.
-        from service.benchmark.method import method_named  # noqa: PLC0415
+        from service.benchmark.methods import method_named  # noqa: PLC0415
         from service.benchmark.running import Trial, run_trial  # noqa: PLC0415
         from service.compute.ground_truth.distances.chamfer import ChamferSettings  # noqa: PLC0415
         from service.dataset.posed.of_folder import data_set_of_folder  # noqa: PLC0415

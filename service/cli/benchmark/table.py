@@ -25,10 +25,13 @@ def table_command(
     """
     with reporting_errors(json):
         # These load the numerics, which take seconds.
-        from service.benchmark.figure import figure_png  # noqa: PLC0415
-        from service.benchmark.method import methods  # noqa: PLC0415
+        from service.benchmark.methods import methods  # noqa: PLC0415
         from service.benchmark.records import read_results  # noqa: PLC0415
-        from service.benchmark.table import table_markdown, table_record  # noqa: PLC0415
+        from service.benchmark.table import (  # noqa: PLC0415
+            figure_png,
+            table_markdown,
+            table_record,
+        )
 
         results, known = read_results(out), methods()
         text = table_markdown(results, known)

@@ -21,8 +21,7 @@ from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import IntegrityError
 from service.core.gates.release import release_meaning
 from service.people.authorisation import Identity
-from service.people.errors import NotAllowedError
-from service.people.roles import ROLES, Permission, may
+from service.people.person import ROLES, NotAllowedError, Permission, may
 from service.run_acts import release_run, require_releasable
 from service.run_record import read_log
 from service.run_start import recorded_run

@@ -38,8 +38,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.logs.file_log import file_log
 from service.monitor.alarm import alarm_of
-from service.monitor.devices import OpenDevices
-from service.monitor.reporter import Reporter
+from service.monitor.reporter import OpenDevices, Reporter
 from service.people.approvals import approve
 from service.people.authorisation import Identity
 from service.people.sessions import People

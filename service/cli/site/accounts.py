@@ -8,8 +8,8 @@ import typer
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
-from service.people.errors import NotAllowedError
-from service.people.names import plain_name
+from service.people.person import NotAllowedError
+from service.people.rows import plain_name
 from service.people.sessions import People
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint

@@ -31,7 +31,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import HostClock
 from service.core.units import gigabytes
-from service.monitor.host_clock import host_clock
+from service.monitor.host import host_clock
 from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.station import Station

@@ -11,8 +11,7 @@ from prometheus_client.registry import Collector
 from service.core.equipment.clocks import ClockReading
 from service.core.equipment.disk_space import Forecast
 from service.core.errors import OrthocaptureError
-from service.monitor.figures import Figures
-from service.monitor.health import Health
+from service.monitor.figures import Figures, Health
 
 _PREFIX = "orthocapture_"
 

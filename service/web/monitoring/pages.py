@@ -12,8 +12,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCol
 from service.core.equipment.clocks import clock_readings
 from service.core.equipment.disk_space import Forecast
 from service.core.errors import StoreError
-from service.monitor.figures import read_figures
-from service.monitor.health import read_health
+from service.monitor.figures import read_figures, read_health
 from service.store.files.space_used import forecast_of
 from service.web.monitoring.metrics import DataFolderMetrics
 from service.web.monitoring.request_counts import RequestCounts

@@ -16,7 +16,7 @@ from fastapi.responses import JSONResponse, RedirectResponse
 from starlette.exceptions import HTTPException
 
 from service.core.errors import ConfigurationError, DataError, IntegrityError, OrthocaptureError, ProtocolError
-from service.people import errors as people
+from service.people import person as people
 from service.store.errors import UnknownRunError
 from service.web.page.rendering import render
 from service.web.security.guards import token_of

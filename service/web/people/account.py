@@ -9,8 +9,8 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, Field
 
 from service.core.errors import OrthocaptureError
-from service.people.credentials.tries import on_screen_of
-from service.people.errors import AccountError, AccountJustChangedError, SignInRefusedError
+from service.people.person import AccountError, AccountJustChangedError, SignInRefusedError
+from service.people.tries import on_screen_of
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
 from service.web.people import administration

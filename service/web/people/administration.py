@@ -11,8 +11,7 @@ from markupsafe import Markup
 
 from service.core.errors import OrthocaptureError
 from service.people.accounts import INVITATION_S
-from service.people.errors import AccountError
-from service.people.roles import ROLES, Role
+from service.people.person import ROLES, AccountError, Role
 from service.store.durable_effects import utc_text
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render

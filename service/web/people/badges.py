@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Form, Path, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from service.core.errors import OrthocaptureError
-from service.people.errors import AccountError, SignInRefusedError
+from service.people.person import AccountError, SignInRefusedError
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
 from service.web.run.forms import Reason

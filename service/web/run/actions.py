@@ -33,9 +33,9 @@ from service.core.text.reasons import reason_of
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
 from service.people.control import Control
-from service.people.credentials.tries import on_screen_of
-from service.people.errors import NotAllowedError
+from service.people.person import NotAllowedError
 from service.people.sessions import NAMES, KnownBy
+from service.people.tries import on_screen_of
 from service.rig import load_rig
 from service.run_acts import DECIDE_AGAIN, cancel_computation, out_of_date, see_robot, tick_item
 from service.run_record import RunRecord

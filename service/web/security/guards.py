@@ -10,9 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from service.people.control import Control
-from service.people.errors import NotAllowedError, NotSignedInError, ScreenLockedError
-from service.people.person import Person
-from service.people.roles import Permission
+from service.people.person import NotAllowedError, NotSignedInError, Permission, Person, ScreenLockedError
 from service.web.server.connections import Connection
 from service.web.site import CurrentSite, Site
 
@@ -92,7 +90,7 @@ def requires(permission: Permission, *, while_locked: bool | tuple[str, ...] = F
     """The guard of a route: `dependencies=[Depends(requires("read"))]`.
 
     Args:
-        permission: of service.people.roles.
+        permission: of service.people.person.
         while_locked: whether a locked screen may do it too; or the values of the form field `verb` that it may do.
     """
     return Guard(permission, while_locked)

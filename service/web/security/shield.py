@@ -13,7 +13,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.people.errors import TooManyTriesError
+from service.people.person import TooManyTriesError
 from service.store.durable_effects import Clock
 
 BODY_LIMIT_BYTES = 1_000_000

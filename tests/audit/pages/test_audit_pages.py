@@ -10,7 +10,7 @@ import pytest
 from fastapi.routing import APIRoute
 
 from service.audit.overview import first_page
-from service.people.roles import may
+from service.people.person import may
 from service.store.verification.verify import verify
 from service.web.audit import corrections, overview, runs, signatures
 from service.web.evidence import artefacts, events

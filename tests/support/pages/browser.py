@@ -20,7 +20,7 @@ import pytest
 from axe_playwright_python.base import AXE_SCRIPT
 from playwright.sync_api import Browser, BrowserContext, Locator, Page, Route, expect, sync_playwright
 
-from service.people.roles import Role
+from service.people.person import Role
 from service.people.sessions import People
 from service.store.store import Store
 from tests.support.processes.forked import Forked

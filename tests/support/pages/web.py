@@ -18,8 +18,7 @@ from argon2 import PasswordHasher
 from fastapi import FastAPI
 
 from service.people.control import Control
-from service.people.person import Person
-from service.people.roles import ROLES, Role
+from service.people.person import ROLES, Person, Role
 from service.people.sessions import People
 from service.rig import load_rig
 from service.station import devices_of

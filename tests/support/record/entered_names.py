@@ -17,7 +17,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.people.errors import AccountError
+from service.people.person import AccountError
 from service.people.sessions import People
 from service.store.backup.backup import BackupOptions, back_up
 from service.store.journal.lines import NAME as JOURNAL_NAME

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from service.core.records.events import AccountChanged, SignInRecorded
-from service.people.errors import PeopleError
-from service.people.person import Person
+from service.people.person import PeopleError, Person
 from service.people.sessions import People
 from service.store.records import SITE
 from service.store.store import Store

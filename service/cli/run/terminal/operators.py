@@ -25,7 +25,7 @@ from service.core.text.reasons import reason_of
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for
-from service.people.errors import PeopleError
+from service.people.person import PeopleError
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
 

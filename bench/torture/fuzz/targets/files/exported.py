@@ -14,12 +14,10 @@ import numpy as np
 from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from service.audit.export.wanted import ExportRequest, WantedExport, keep_request, kept_request
-from service.benchmark.matching.result import MethodResult, read_result, write_result
-from service.benchmark.matching.running import open_matching_data, results_in
-from service.benchmark.matching.table import markdown
-from service.benchmark.method import methods
+from service.benchmark.matching import open_matching_data, results_in
+from service.benchmark.matching_results import MethodResult, markdown, read_result, write_result
+from service.benchmark.methods import from_unit_box, methods
 from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Score, read_results
-from service.benchmark.shared_parts import from_unit_box
 from service.benchmark.table import table_markdown
 from service.compute.ground_truth.ply import read_ply, write_ply
 from service.compute.ground_truth.surface import Surface
@@ -204,7 +202,7 @@ def _region(data: bytes, _: Path) -> None:
 
 
 _H5 = "service.dataset.posed.of_folder:data_set_of_folder"
-_MATCHING = "service.benchmark.matching.running:open_matching_data"
+_MATCHING = "service.benchmark.matching:open_matching_data"
 TARGETS: tuple[Target, ...] = (
     *(
         Target(f"data_set_{name}", _H5, functools.partial(_data_set, file), functools.partial(_of, "hdf5", file),
@@ -223,10 +221,10 @@ TARGETS: tuple[Target, ...] = (
         )
     ),
     Target(
-        "matching_result", "service.benchmark.matching.result:read_result", _matching_result, _matching_results, JSON
+        "matching_result", "service.benchmark.matching_results:read_result", _matching_result, _matching_results, JSON
     ),
     Target("benchmark_result", "service.benchmark.records:read_results", _result, _results, JSON),
-    Target("unit_box", "service.benchmark.shared_parts:from_unit_box", _box, _boxes, JSON),
+    Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
     Target("own_ply", "service.compute.ground_truth.ply:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview.records:read_preview", _preview, _previews, JSON),
     Target("export_request", "service.audit.export.wanted:kept_request", _request, _requests, JSON),

@@ -1,4 +1,4 @@
-"""How well this machine's clock is synchronised: from chrony if it runs, otherwise from the kernel."""
+"""Tells how this machine does: how well its clock is synchronised, and how long threads waited for a processor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
+import time
 
+from drivers.machine_pressure import processor_time
 from service.core.records.events import HostClock
 from service.core.units import seconds_of_us
 
@@ -77,3 +80,20 @@ def _of_kernel() -> HostClock:
         offset_s=None,
         error_s=error_s if synchronised and error_s < _NOT_SET_S else None,
     )
+
+
+def processor_s() -> float:
+    """Seconds that this thread has computed or waited for a processor, as far as the system tells of waits."""
+    try:
+        times = processor_time(threading.get_native_id())
+    except OSError:
+        return time.thread_time()
+    return times.computed_s + times.waited_s
+
+
+def waited_s(thread: int) -> float:
+    """Seconds that a thread (its native id) has waited for a processor; 0 where no system tells it."""
+    try:
+        return processor_time(thread).waited_s
+    except OSError:
+        return 0.0

@@ -1,1 +1,0 @@
-"""Passwords, PINs, badges, and failed tries."""
