@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
+from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.hand_eye.reprojection import BoardCorners
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
 from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, moved, normal_equations
 from service.compute.poses.hybrid.rows import linearise

@@ -17,8 +17,7 @@ from hypothesis.extra.numpy import arrays
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.compute.arm.inverse_kinematics import nearest_posture, postures
-from service.compute.arm.kinematics import forward
+from service.compute.arm_kinematics import forward, nearest_posture, postures
 from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
 from service.compute.planning.collision import Capsule, nearest_contacts, straight_path
 from service.compute.planning.motion_plan import (

@@ -22,7 +22,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
         "service/compute/registration/further_cameras/*.py",
         "service/compute/poses/hybrid/stated_covariance.py",
         "service/compute/poses/files/pose_covariance.py",
-        "service/compute/calibration/intrinsics/uncertainty.py",
+        "service/compute/intrinsics/uncertainty.py",
         "service/dataset/posed/of_run/pose_errors.py",
         "service/dataset/posed/of_run/view_covariances.py",
         "service/core/geometry.py",

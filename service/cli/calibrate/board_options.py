@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from service.cli.common import progress_bar
-from service.compute.calibration.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
-from service.compute.calibration.board.images import UsableViews, find_boards, probe_board, usable_views
+from service.compute.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
+from service.compute.board.search import UsableViews, find_boards, probe_board, usable_views
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import metres, mm
 

@@ -34,24 +34,22 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
-from service.compute.calibration.board.images import UsableViews
-from service.compute.calibration.intrinsics.adjustment import LensModel
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
-from service.compute.calibration.intrinsics.optics import Optics, compare_optics, states_focus, summary
-from service.compute.calibration.intrinsics.plots import calibration_plots
-from service.compute.calibration.intrinsics.uncertainty import (
-    ProjectionUncertainty,
-    board_distance_m,
-    projection_uncertainty,
-)
-from service.compute.calibration.intrinsics.validation import (
-    MIN_VIEWS_TO_VALIDATE,
-    CrossValidation,
-    calibration_warnings,
-    cross_validate,
-)
+from service.compute.board.search import UsableViews
 from service.compute.images.files import image_size
 from service.compute.images.folder import image_folder
+from service.compute.intrinsics.adjustment import LensModel
+from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
+from service.compute.intrinsics.optics import Optics, compare_optics, states_focus, summary
+from service.compute.intrinsics.plots import calibration_plots
+from service.compute.intrinsics.uncertainty import (
+    MIN_VIEWS_TO_VALIDATE,
+    CrossValidation,
+    ProjectionUncertainty,
+    board_distance_m,
+    calibration_warnings,
+    cross_validate,
+    projection_uncertainty,
+)
 from service.core.errors import ComputeError, DataError
 from service.core.text.counts import counted
 from service.jobs.calibration.records import Intrinsics

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from service.compute.arm.kinematics import chain
+from service.compute.arm_kinematics import chain
 from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
 from service.core.arms.model import ArmModel
 from service.core.geometry import Array, Transform, apply, inverse

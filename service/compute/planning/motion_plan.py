@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from service.compute.arm.inverse_kinematics import postures_near
+from service.compute.arm_kinematics import postures_near
 from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts
 from service.compute.planning.detour import Freedom, detour
 from service.compute.planning.optics import DepthOfField, depths_m

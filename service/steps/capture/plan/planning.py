@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from service.compute.arm.inverse_kinematics import nearest_posture
+from service.compute.arm_kinematics import nearest_posture
 from service.compute.planning.collision import ArmBody, Capsule, Obstacles
 from service.compute.planning.motion_plan import (
     MotionPlan,

@@ -27,8 +27,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.hand_eye.closed_form import scaled
 from service.compute.descent import gauss_newton, largest
+from service.compute.hand_eye.setup import scaled
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, increment, skew
 

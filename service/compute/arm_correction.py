@@ -1,4 +1,4 @@
-"""An arm's systematic error: how it was built and its gears' periodic errors, and the correction of poses by them."""
+"""Models an arm's systematic error, how it was built and its gears' periodic errors, and corrects poses by it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.arm.kinematics import chain, dh_jacobian, parallel_jacobian, pose_gap
+from service.compute.arm_kinematics import chain, dh_jacobian, parallel_jacobian, pose_gap
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.errors import DataError

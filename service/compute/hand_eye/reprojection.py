@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.hand_eye.weighted import linearise
+from service.compute.board.board import Board, BoardView
 from service.compute.camera_model import CameraModel
 from service.compute.descent import halved_gauss_newton, largest
+from service.compute.hand_eye.weighted import linearise
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, increment, inverse, skew
 

@@ -1,18 +1,20 @@
-"""Suggests the next board poses for a hand-eye calibration: those that shrink T_flange_camera's covariance most."""
+"""Suggests and draws the next board poses: those that shrink the covariance of T_flange_camera most."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.hand_eye.answers import HandEyeAnswer
-from service.compute.calibration.hand_eye.reprojection import projection_jacobian
-from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel
+from service.compute.hand_eye.estimate import HandEyeAnswer
+from service.compute.hand_eye.reprojection import projection_jacobian
+from service.compute.hand_eye.weighted import linearise
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.units import deg, metres, mm
@@ -21,7 +23,7 @@ _TILTS_DEG = (0.0, 12.0, 25.0, 38.0, 48.0)
 _AZIMUTHS = 12
 _ROLLS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
 _DISTANCES = (0.8, 1.0)  # times the median distance so far
-_MARGIN = 0.02  # of the image's width, free of corners
+_FREE_MARGIN = 0.02  # of the image's width, free of corners
 _MOST_TRIED = 60  # of the best candidates, until one is reachable
 _FLOOR_M, _FLOOR_RAD = 1e-5, 1e-5
 
@@ -125,7 +127,7 @@ def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, 
     boards = np.array([inverse(T) @ T_base_board for T in all_poses])
     seen = np.einsum("nij,pj->npi", boards[:, :3, :3], points_m) + boards[:, None, :3, 3]
     pixels = camera.project(seen.reshape(-1, 3)).reshape(len(boards), -1, 2)
-    margin = _MARGIN * camera.width
+    margin = _FREE_MARGIN * camera.width
     inside = (pixels > margin) & (pixels < np.array([camera.width, camera.height]) - margin)
     return all_poses[inside.all(axis=(1, 2))]
 
@@ -180,3 +182,98 @@ def _covariance_of(information: Array) -> Array:
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return (np.linalg.inv(information * both) * both)[:, :6, :6]
+
+
+_PANEL_PX = 700  # px
+_MARGIN_PX = 50
+_TAKEN, _SUGGESTED, _BOARD, _INK = (150, 150, 150), (20, 90, 230), (60, 140, 60), (40, 40, 40)  # BGR
+_LABEL = 14  # px; labels nearer than this are joined: poses often differ only in their roll
+_DEPTH_M = 0.07  # of a camera's pyramid
+
+
+def draw_board_plan(
+    T_base_camera: Array,
+    suggested: Sequence[SuggestedPose],
+    T_base_board: Transform,
+    points_m: Array,
+    camera: CameraModel,
+) -> bytes:
+    """PNG: cameras as pyramids around the board; taken ones grey, suggested ones in colour with their numbers."""
+    middle = points_m.mean(axis=0)
+    lift = T_base_board.copy()
+    lift[:3, 3] = apply(T_base_board, middle)
+    to_board = inverse(lift)  # x, y along the board, z away from the cameras
+    taken = [to_board @ T for T in T_base_camera]
+    wanted = [to_board @ pose.T_base_camera for pose in suggested]
+    outline = np.array([[x, y, 0.0] for x, y in _corners(points_m - middle)])
+    panels = [
+        _panel("from above", taken, wanted, outline, camera, np.array([[1.0, 0, 0], [0, 1.0, 0]])),
+        _panel("from the side", taken, wanted, outline, camera, np.array([[1.0, 0, 0], [0, 0, 1.0]])),
+    ]
+    picture = np.hstack(panels)
+    text = f"{len(taken)} taken (grey), {len(wanted)} suggested (red, in order)"
+    _text(picture, text, (_MARGIN_PX, 2 * _PANEL_PX // 50))
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
+def _corners(points: Array) -> list[tuple[float, float]]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+
+
+def _panel(
+    title: str,
+    taken: Sequence[Transform],
+    wanted: Sequence[Transform],
+    board: Array,
+    camera: CameraModel,
+    axes: Array,
+) -> NDArray[np.uint8]:
+    canvas = np.full((_PANEL_PX, _PANEL_PX, 3), 255, dtype=np.uint8)
+    everything = np.vstack([board, *(T[None, :3, 3] for T in [*taken, *wanted])]) @ axes.T
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    scale = (_PANEL_PX - 3 * _MARGIN_PX) / float(max((high - low).max(), 1e-6))
+    centre = (low + high) / 2
+
+    def at(points: Array) -> NDArray[np.int32]:
+        return np.round(((points @ axes.T) - centre) * scale + _PANEL_PX / 2).astype(np.int32)
+
+    cv2.polylines(canvas, [at(board)], isClosed=True, color=_BOARD, thickness=3, lineType=cv2.LINE_AA)
+    for T_board_camera in taken:
+        _pyramid(canvas, at(_frustum(T_board_camera, camera)), _TAKEN, 1)
+    labels: dict[tuple[int, int], str] = {}
+    for number, T_board_camera in enumerate(wanted, start=1):
+        corners = at(_frustum(T_board_camera, camera))
+        _pyramid(canvas, corners, _SUGGESTED, 2)
+        eye = (int(corners[0, 0]) + 8, int(corners[0, 1]) - 8)
+        place = next((p for p in labels if max(abs(p[0] - eye[0]), abs(p[1] - eye[1])) < _LABEL), eye)
+        labels[place] = f"{labels[place]}, {number}" if place in labels else str(number)
+    for place, label in labels.items():
+        _text(canvas, label, place, _SUGGESTED)
+    _text(canvas, title, (_MARGIN_PX, _PANEL_PX - 20))
+    bar = round(0.1 * scale)
+    cv2.line(
+        canvas, (_PANEL_PX - _MARGIN_PX - bar, _PANEL_PX - 25), (_PANEL_PX - _MARGIN_PX, _PANEL_PX - 25), _INK, 2
+    )
+    _text(canvas, "10 cm", (_PANEL_PX - _MARGIN_PX - bar, _PANEL_PX - 32))
+    return canvas
+
+
+def _frustum(T: Transform, camera: CameraModel) -> Array:
+    """(5, 3) camera centre and the four image corners, the top edge first."""
+    x, y = camera.width / camera.fx / 2, camera.height / camera.fy / 2
+    rays = np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]) * _DEPTH_M
+    return apply(T, rays)
+
+
+def _pyramid(canvas: NDArray[np.uint8], corners: NDArray[np.int32], colour: tuple[int, int, int], width: int) -> None:
+    eye, frame = corners[0], corners[1:]
+    cv2.polylines(canvas, [frame], isClosed=True, color=colour, thickness=width, lineType=cv2.LINE_AA)
+    for corner in frame:
+        cv2.line(canvas, (int(eye[0]), int(eye[1])), (int(corner[0]), int(corner[1])), colour, width, cv2.LINE_AA)
+    top = [(int(x), int(y)) for x, y in frame[:2]]
+    cv2.line(canvas, top[0], top[1], colour, width + 2, cv2.LINE_AA)  # marks the image's top
+
+
+def _text(canvas: NDArray[np.uint8], text: str, at: tuple[int, int], colour: tuple[int, int, int] = _INK) -> None:
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

@@ -10,7 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from service.compute.calibration.board.board import Board, Grey
+from service.compute.board.board import Board, Grey
 from service.core.geometry import Array
 from service.core.units import mm
 

@@ -1,4 +1,4 @@
-"""The fits behind a hand-eye calibration: outlier rejection, the weighted fit, and the arm's systematic error."""
+"""Fits a hand-eye calibration: outlier rejection, the weighted fit, and the arm's systematic error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from service.compute.arm.correction import (
+from service.compute.arm_correction import (
     ArmCorrection,
     check_arm,
     corrected_T_base_flange,
@@ -19,7 +19,8 @@ from service.compute.arm.correction import (
     dh_joints,
     gear_count,
 )
-from service.compute.calibration.hand_eye.closed_form import (
+from service.compute.hand_eye.reprojection import BoardCorners, solve_reprojection
+from service.compute.hand_eye.setup import (
     MIN_VIEWS,
     RobustStart,
     deviation,
@@ -29,8 +30,7 @@ from service.compute.calibration.hand_eye.closed_form import (
     solve_closed_form,
     solve_with_scale,
 )
-from service.compute.calibration.hand_eye.reprojection import BoardCorners, solve_reprojection
-from service.compute.calibration.hand_eye.weighted import (
+from service.compute.hand_eye.weighted import (
     FLOOR_M,
     GEOMETRY_KINDS,
     BoardViews,

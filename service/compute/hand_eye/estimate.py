@@ -1,4 +1,4 @@
-"""Hand-eye calibration: the camera in the flange frame and the board in the base frame, with their uncertainty."""
+"""Estimates the camera in the flange frame and the board in the base frame, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -11,23 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeResult
-from service.compute.calibration.hand_eye.board_size import (
-    BoardSizeFound,
-    contradictions,
-    size_found,
-    size_sigma,
-)
-from service.compute.calibration.hand_eye.closed_form import (
-    CLOSED_FORMS,
-    all_closed_forms,
-    deviation,
-    distance,
-    observability,
-    untwist,
-)
-from service.compute.calibration.hand_eye.fit import (
+from service.compute.arm_correction import ArmCorrection
+from service.compute.board.board import Board
+from service.compute.camera_covariance import CameraCovariance
+from service.compute.hand_eye.fit import (
     ArmTerms,
     HandEyeMeasurements,
     HandEyeSolution,
@@ -43,21 +30,128 @@ from service.compute.calibration.hand_eye.fit import (
     turned_back,
     without_size,
 )
-from service.compute.calibration.hand_eye.reprojection import BoardCorners, board_covariance
-from service.compute.calibration.hand_eye.setup import PosesAsRead, Setup, check_setup, inverted
-from service.compute.calibration.hand_eye.spread import (
+from service.compute.hand_eye.reprojection import BoardCorners, board_covariance
+from service.compute.hand_eye.setup import (
+    CLOSED_FORMS,
+    PosesAsRead,
+    Setup,
+    all_closed_forms,
+    check_setup,
+    deviation,
+    distance,
+    inverted,
+    observability,
+    untwist,
+)
+from service.compute.hand_eye.uncertainty import (
+    BoardSizeFound,
     bootstrap_counts,
     bootstrap_covariance,
     bootstrap_picks,
     camera_share,
+    contradictions,
     not_below_held_out,
+    size_found,
+    size_sigma,
 )
-from service.compute.calibration.hand_eye.weighted import Noise
-from service.compute.camera_covariance import CameraCovariance
+from service.compute.hand_eye.weighted import Noise
 from service.core.arms.model import ArmModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 from service.core.units import deg, mm
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeAnswer:
+    """T_flange_camera, T_base_board and measures of their quality; arrays are over the N views.
+
+    Attributes:
+        T_flange_camera: the calibration.
+        T_base_board: the board's pose.
+        sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
+        sigma_deg: bootstrap standard deviation of the rotation.
+        covariance: (6, 6) of T_flange_camera from the bootstrap, (d in metres, w in radians) in the flange's axes,
+            including `camera_share`.
+        camera_share: (6, 6) part of it due to the camera calibration's uncertainty, which more images do not reduce.
+        formal_covariance: (6, 6) predicted by the fit's own noise model; None unless the method is weighted.
+        robot_noise_mm: standard deviation per axis of the robot's remaining position error; None unless the method is
+            weighted.
+        robot_noise_deg: the same for its rotation.
+        residual_mm: (N,) distance between the board as placed by each view and T_base_board, at the board's middle.
+        residual_deg: (N,) the same for its orientation.
+        held_out_mm: (N,) as residual_mm, but each view is judged by a calibration without its fold.
+        held_out_deg: (N,) the same for its orientation.
+    """
+
+    T_flange_camera: Transform
+    T_base_board: Transform
+    sigma_mm: float
+    sigma_deg: float
+    covariance: Array
+    camera_share: Array
+    formal_covariance: Array | None
+    robot_noise_mm: float | None
+    robot_noise_deg: float | None
+    residual_mm: Array
+    residual_deg: Array
+    held_out_mm: Array
+    held_out_deg: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedHandEye(HandEyeAnswer):
+    """The answer for poses corrected by `correction` (`corrected_T_base_flange`).
+
+    Attributes:
+        correction: the arm's systematic error.
+        terms: which of its parameters were estimated.
+        size: of the board, by the lengths of the corrected arm.
+    """
+
+    correction: ArmCorrection
+    terms: ArmTerms
+    size: BoardSizeFound
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeResult(HandEyeAnswer):
+    """The answer for the robot's poses as reported, and the diagnostics of the calibration.
+
+    Attributes:
+        method: method that gave T_flange_camera.
+        methods: T_flange_camera by every method that gave an answer.
+        spread_mm: largest distance between the chosen method's translation and another's (including Tsai's and
+            Andreff's, which are the weakest: a large spread warns of weak data).
+        spread_deg: the same for the rotation.
+        corner_sigma_px: standard deviation of the corners; None if only board poses were given.
+        rotation_spread_deg: largest rotation between two views.
+        second_axis_deg: root mean square rotation about the second best axis.
+        condition: condition number of the translation's linear system; infinite for a single rotation axis.
+        turned: (N,) whether the view's board pose was rotated by half a turn.
+        excluded: reason by index of each view that no fit used.
+        corrected: the answer with the arm's systematic error estimated; None if no joints were given or if it does
+            not lower the held-out error.
+        arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
+            reported).
+        size: of the board, by the robot's lengths.
+        findings: what the measurements contradict, in words; empty if nothing.
+    """
+
+    method: Method
+    methods: dict[Method, Transform]
+    spread_mm: float
+    spread_deg: float
+    corner_sigma_px: float | None
+    rotation_spread_deg: float
+    second_axis_deg: float
+    condition: float
+    turned: tuple[bool, ...]
+    excluded: dict[int, str]
+    corrected: CorrectedHandEye | None
+    arm_held_out_mm: dict[ArmTerms, float]
+    size: BoardSizeFound
+    findings: tuple[str, ...]
+
 
 _FOLDS = 5
 _FEW = 24  # up to this many views, use twice the folds: leaving a fifth out would change the answer

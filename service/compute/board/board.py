@@ -1,4 +1,4 @@
-"""Calibration boards and their points in images: checkerboard, ChArUco, asymmetric circle grid."""
+"""Describes calibration boards and finds their points in an image: checkerboard, ChArUco, asymmetric circle grid."""
 
 from __future__ import annotations
 

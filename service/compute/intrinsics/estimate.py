@@ -1,4 +1,4 @@
-"""The camera's intrinsics from views of a board, with their covariance and the outlying views."""
+"""Estimates a camera's intrinsics from views of a board, with their covariance, and names outlying views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.intrinsics.adjustment import (
+from service.compute.board.board import Board, BoardView
+from service.compute.camera_model import CameraModel
+from service.compute.intrinsics.adjustment import (
     PARAMETER_COUNT,
     PARAMETERS,
     Adjustment,
@@ -22,7 +23,6 @@ from service.compute.calibration.intrinsics.adjustment import (
     start,
     start_pose,
 )
-from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 from service.core.units import deg

@@ -1,4 +1,4 @@
-"""Plots of a calibration as PNG: corner coverage, residuals, projection uncertainty."""
+"""Plots a calibration as PNG: corner coverage, residuals, projection uncertainty."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
-from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
-from service.compute.calibration.intrinsics.validation import residual_field
+from service.compute.intrinsics.estimate import IntrinsicsResult
+from service.compute.intrinsics.uncertainty import ProjectionUncertainty, residual_field
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
