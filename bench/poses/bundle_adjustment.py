@@ -31,8 +31,8 @@ from service.compute.poses.colmap.convention import (
     to_colmap_pose,
 )
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
-from service.compute.registration.identification.identity import identify
-from service.compute.registration.settings import RegistrationSettings
+from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.identity import identify
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages
 from service.core.geometry import Array, align_points, apply

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.compute.hand_eye.uncertainty import BoardSizeFound
-from service.compute.registration.identification.other_scale import words_of_unit
+from service.compute.registration.identity import words_of_unit
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.units import MISTAKEN_LENGTHS, mistaken_length

@@ -22,7 +22,7 @@ from service.compute.markers.search.predicted import NEAR, ImageOutlines, Predic
 from service.compute.planning.coverage import (
     CoverageLimits,
 )
-from service.compute.registration.identification.pairing import paired
+from service.compute.registration.hypotheses import paired
 from service.core.arms.known import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote

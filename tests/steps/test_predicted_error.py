@@ -29,8 +29,8 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.settings import CommonErrors, RegistrationSettings
+from service.compute.registration.cost import CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment
 from service.compute.registration.solve import register
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError

@@ -13,7 +13,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph, adjust
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.settings import EXPECTED_COMMON_ERRORS
+from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 

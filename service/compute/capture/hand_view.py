@@ -16,8 +16,8 @@ from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.planning.information import ViewInformation, view_information
-from service.compute.registration.identification.identity import identify_each
-from service.compute.registration.identification.pairing import paired
+from service.compute.registration.hypotheses import paired
+from service.compute.registration.identity import identify_each
 from service.compute.scene import ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError

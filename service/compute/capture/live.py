@@ -18,9 +18,10 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.quality import image_quality
 from service.compute.markers.outlines.edges import profiles, sample
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import Assignment, identify
-from service.compute.registration.identification.pairing import paired
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.hypotheses import paired
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse

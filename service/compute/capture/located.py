@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from service.compute.camera_model import CameraModel
 from service.compute.capture.hand_view import pose_by_spheres
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import identify_each
+from service.compute.registration.identity import identify_each
 from service.compute.scene import ScanSpheres
 from service.core.geometry import Transform, inverse
 

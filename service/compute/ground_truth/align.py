@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from service.compute.evaluation.closure import compare_shapes
+from service.compute.evaluation.error_budget import compare_shapes
 from service.compute.ground_truth.frames import DistanceChange, distance_changes
 from service.compute.ground_truth.surface import Surface
 from service.compute.surfaces.constellations import match_constellations

@@ -11,7 +11,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.identification.pairing import CONTROL_GATE, paired
+from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs.references import jobs_of
 from service.core.units import metres

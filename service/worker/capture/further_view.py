@@ -10,7 +10,7 @@ from service.compute.images.files import read_image_of
 from service.compute.markers.archive import outline_record
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.further_cameras.pose import sighted_pose
+from service.compute.registration.further_camera import sighted_pose
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import inverse

@@ -12,7 +12,7 @@ from service.compute.planning.coverage import covered_fraction
 from service.compute.planning.hand_guidance import WantedView, covered, nearest, place_at, words
 from service.compute.planning.information import lens_covariance_of_pose, predicted_information
 from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
-from service.compute.registration.settings import EXPECTED_COMMON_ERRORS
+from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 from service.jobs.capture import hand_view as job

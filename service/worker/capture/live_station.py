@@ -20,7 +20,7 @@ from service.compute.planning.information import (
     pose_scatter,
     view_information,
 )
-from service.compute.registration.identification.pairing import paired
+from service.compute.registration.hypotheses import paired
 from service.compute.scene import ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse
 from service.jobs.capture.live_view import LiveArguments

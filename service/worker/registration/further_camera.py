@@ -17,7 +17,7 @@ from service.compute.markers.developed import remeasure_file
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all
 from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.further_cameras.pose import (
+from service.compute.registration.further_camera import (
     FurtherPose,
     OuterFrame,
     SightedPose,
@@ -25,7 +25,7 @@ from service.compute.registration.further_cameras.pose import (
     rigid_pose,
     sighted_pose,
 )
-from service.compute.registration.further_cameras.pose_covariances import of_inverse, of_product
+from service.compute.registration.pose_errors import of_inverse, of_product
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse

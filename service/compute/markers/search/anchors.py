@@ -22,8 +22,9 @@ from service.compute.markers.outlines.refine import refine_outlines
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.markers.search.predicted import WIDE, Tone, deviation, tone_of
-from service.compute.registration.identification.identity import Assignment, identify
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse

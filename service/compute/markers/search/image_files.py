@@ -23,8 +23,8 @@ from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOu
 from service.compute.markers.search.anchors import AnchorRegistration, MapFunction, register_anchors
 from service.compute.markers.search.nearby import find_nearby
 from service.compute.markers.search.predicted import ImageOutlines, PredictedSpheres, find_outlines
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.identification.pairing import paired
+from service.compute.registration.hypotheses import paired
+from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import inverse
 from service.logs.terminal import show_own_words_only

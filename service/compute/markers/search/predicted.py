@@ -18,7 +18,7 @@ from service.compute.markers.outlines.edges import envelope_edges, profiles, sam
 from service.compute.markers.outlines.refine import AveragedCone, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.compute.markers.search.cone_pose import fit_pose
-from service.compute.registration.identification.pairing import MatchGate
+from service.compute.registration.hypotheses import MatchGate
 from service.core.geometry import Array, Transform, apply
 
 # Lengths below are fractions of a sphere's apparent radius, unless the name has a unit.

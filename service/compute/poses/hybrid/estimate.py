@@ -23,9 +23,10 @@ from service.compute.poses.hybrid.adjustment import BundleSolution, solve
 from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, whitening_of
 from service.compute.poses.hybrid.camera_error import camera_share
 from service.compute.poses.sfm.tracks import Tracks
-from service.compute.registration.identification.identity import identify
-from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.cost import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
+from service.compute.registration.identity import identify
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, skew, transform

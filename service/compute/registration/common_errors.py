@@ -1,13 +1,4 @@
-"""Errors that all outlines share and that the model takes as small: found by a fit that leaves them free.
-
-A registration holds the camera as calibrated, and common shifts and growths of the outlines near zero. If the
-outlines say otherwise, its residuals may look harmless while the scan is misplaced by more than the stated sigma. A
-second fit with these errors free tells how large they are, and how far the scan moves with them: that much is
-uncertain, since the outlines alone do not tell which of several inputs is wrong.
-
-A list of spheres in another scale than the camera positions looks like a wrong focal length, and the other way round.
-Where there is a sign of either, a third fit leaves both free: they differ in how perspective changes with depth.
-"""
+"""Finds errors that all outlines share and that the model takes as small, by a fit that leaves them free."""
 
 from __future__ import annotations
 
@@ -19,12 +10,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from service.compute.contradictions.findings import Contradiction
 from service.compute.markers.outlines.refine import SYSTEMATIC_PER_BLUR
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.contradictions import Contradiction
+from service.compute.registration.cost import CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment
 from service.compute.registration.result import RegistrationResult
-from service.compute.registration.settings import CommonErrors, RegistrationSettings
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
