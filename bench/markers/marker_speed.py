@@ -26,9 +26,9 @@ from bench.scenes import rendered
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
+from service.compute.markers.image_files import ANCHOR_WIDTH_PX
+from service.compute.markers.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.anchors import ANCHOR_WIDTH_PX
-from service.compute.markers.search.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.files.pose_files import read_poses
 from service.core.geometry import inverse

@@ -32,8 +32,8 @@ from service.compute.images.develop_parameters import PARAMETERS, DevelopParamet
 from service.compute.images.files import read_image
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.detect import detect_spheres
-from service.compute.markers.developed import remeasure
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.refine import remeasure
 from service.compute.pipeline import register_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse

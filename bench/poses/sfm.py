@@ -22,7 +22,7 @@ from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
 from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import true_error_m
-from service.compute.markers.search.image_files import detect_all
+from service.compute.markers.image_files import detect_all
 from service.compute.pipeline import register_images
 from service.compute.poses.hybrid.estimate import hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct

@@ -23,8 +23,8 @@ from bench.scenes import CACHE, render_scene
 from drivers.meshes.mesh_file import read_mesh_file
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
+from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import detect_all
 from service.compute.pipeline import PipelineResult, register_images
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.files.pose_files import read_poses_csv

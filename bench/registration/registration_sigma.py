@@ -17,10 +17,15 @@ from bench.registration.accuracy import Capture, read_capture
 from bench.registration.identity import CAMERA
 from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, true_error_m
-from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.records import OutlineEvidence, SphereOutline, outline_from_cone
-from service.compute.markers.search.image_files import detect_all
+from service.compute.markers.image_files import detect_all
+from service.compute.markers.records import (
+    OutlineEvidence,
+    SphereOutline,
+    outline_from_cone,
+    outline_from_record,
+    outline_record,
+)
 from service.compute.pipeline import register_images
 from service.compute.registration.cost import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment

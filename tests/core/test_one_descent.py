@@ -15,8 +15,8 @@ DESCENT = {"gauss_newton", "halved_gauss_newton", "levenberg_marquardt"}
 
 OWN_LOOPS = {
     "evaluation/error_budget.py": "chooses inliers before each step, and keeps the equations of the last",
-    "markers/outlines/limb.py": "estimates noise, selection and priors again before each step",
-    "markers/outlines/refine.py": "reweights equations that are linear",
+    "markers/limb.py": "estimates noise, selection and priors again before each step",
+    "markers/refine.py": "reweights equations that are linear",
     "poses/hybrid/estimate.py": "solves once for each camera, and iterates nothing",
     "poses/sfm/model/track_building.py": "reweights equations that are linear, for the start of a descent",
     "registration/solve.py": "whitens residuals, to reweight the next descent",

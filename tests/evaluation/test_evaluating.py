@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.markers.archive import outline_record
+from service.compute.markers.records import outline_record
 from service.core.errors import ComputeError
 from service.store.store import Store
 from service.worker.job import JobContext, RecordedContext

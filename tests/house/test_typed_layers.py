@@ -39,7 +39,7 @@ EDGES = {
     "service/audit/verify/bundle_verifier.py": "stands alone in a bundle, with nothing but the standard library",
     # files
     "service/compute/capture/hand_bundle.py": "writes and reads the file of a hand-held image",
-    "service/compute/markers/archive.py": "writes and reads files of outlines",
+    "service/compute/markers/records.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
     "service/compute/poses/files/camera_files.py": "reads JSON files",
     "service/core/protocol/models.py": "the JSON schema of a protocol",

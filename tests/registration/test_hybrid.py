@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_covariance import CameraCovariance
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones
 from service.compute.poses.files.pose_covariance import similarity_covariance
 from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, moved, width
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones, cone_of_sphere
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import (
     Cost,

@@ -30,7 +30,7 @@ from service.cli.common import (
 )
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.images.folder import image_folder
-from service.compute.markers.search.image_files import detect_all
+from service.compute.markers.image_files import detect_all
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_covariance import write_pose_covariance
 from service.compute.poses.files.pose_files import read_poses_csv, write_poses_csv

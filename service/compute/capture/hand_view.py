@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.capture.live import clipped_fraction, expected_spheres, sharpness
 from service.compute.layout.photographs import places_by_size
+from service.compute.markers.cones import ObservedCones, fit_pose
 from service.compute.markers.detect import detect_spheres
-from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import DetectionOptions, SphereOutline
-from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.planning.information import ViewInformation, view_information
 from service.compute.registration.hypotheses import paired
 from service.compute.registration.identity import identify_each

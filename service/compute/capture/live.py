@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.quality import image_quality
-from service.compute.markers.outlines.edges import profiles, sample
+from service.compute.markers.edges import profiles, sample
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.hypotheses import paired
 from service.compute.registration.identity import Assignment, identify

@@ -12,9 +12,8 @@ from scipy.optimize import linear_sum_assignment
 from service.compute.evaluation.accuracy import Evaluation, evaluate
 from service.compute.evaluation.error_budget import TriangulatedSphere, locate_in_images
 from service.compute.markers.cones import Cone
+from service.compute.markers.predicted import CLEARLY_VISIBLE, is_another, visible_cones
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.nearby import is_another
-from service.compute.markers.search.predicted import CLEARLY_VISIBLE, visible_cones
 from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse

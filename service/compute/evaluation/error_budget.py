@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from service.compute.descent import gauss_newton
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identity import Assignment
 from service.core.errors import ComputeError

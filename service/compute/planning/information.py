@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import Cone, ObservedCones, cone_of_sphere
 from service.compute.markers.records import SphereOutline
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from service.compute.markers.outlines.refine import SYSTEMATIC_PER_BLUR
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.refine import SYSTEMATIC_PER_BLUR
 from service.compute.registration.contradictions import Contradiction
 from service.compute.registration.cost import CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment

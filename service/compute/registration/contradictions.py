@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from service.compute.evaluation.control_spheres import WINDOW_M, SearchNearby, evaluate_controls
+from service.compute.markers.predicted import CLEARLY_VISIBLE, visible_cones
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.predicted import CLEARLY_VISIBLE, visible_cones
 from service.compute.registration.hypotheses import image_hypotheses, rivals
 from service.compute.registration.identity import Assignment
 from service.compute.registration.result import RegistrationResult

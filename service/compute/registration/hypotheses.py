@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.descent import gauss_newton
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.core.geometry import Array, Transform, apply, skew, transform
 

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost, PointCost, RegistrationSettings, residuals_and_derivative
 from service.compute.registration.identity import Assignment

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from service.jobs.records import Matrix
 
-OutlineRecord = dict[str, object]  # as service.compute.markers.archive writes it
+OutlineRecord = dict[str, object]  # as service.compute.markers.records writes it
 _OUTLINES_BY_VIEWPOINT = TypeAdapter(dict[str, tuple[OutlineRecord, ...]])
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.archive import outline_from_record
-from service.compute.markers.records import SphereOutline
+from service.compute.markers.records import SphereOutline, outline_from_record
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse

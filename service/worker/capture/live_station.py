@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.capture.live import LiveView, ProvisionalRegistration, register_station
-from service.compute.markers.archive import outline_from_record, outline_record
+from service.compute.markers.records import outline_from_record, outline_record
 from service.compute.planning.information import (
     ViewInformation,
     mounting_covariance,

@@ -28,9 +28,9 @@ from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
 from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.compute.markers.cones import Cone
-from service.compute.markers.detectors import options_for
+from service.compute.markers.detect import options_for
+from service.compute.markers.image_files import search_nearby
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import search_nearby
 from service.compute.pipeline import INTRINSICS, Detection, draw_overlay
 from service.compute.registration.common_errors import UNEXPLAINED
 from service.compute.registration.hypotheses import CONTROL_GATE, paired

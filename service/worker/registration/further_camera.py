@@ -11,11 +11,10 @@ import numpy as np
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
 from service.compute.machine_memory import IMAGE_MB, processes_for
-from service.compute.markers.archive import outline_from_record, outline_record
-from service.compute.markers.detectors import options_for
-from service.compute.markers.developed import remeasure_file
-from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import detect_all
+from service.compute.markers.detect import options_for
+from service.compute.markers.image_files import detect_all
+from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
+from service.compute.markers.refine import remeasure_file
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.registration.further_camera import (
     FurtherPose,

@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, vstack
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError
 from service.core.geometry import Array

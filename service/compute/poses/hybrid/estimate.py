@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.compute.poses.hybrid.adjustment import BundleSolution, solve
 from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, whitening_of

@@ -16,7 +16,7 @@ from bench.torture.fuzz.mutations import JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.camera_model import CameraModel
-from service.compute.markers.search.paper_files import read_boxes
+from service.compute.markers.paper import read_boxes
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_files import (
     read_colmap_model,
@@ -272,7 +272,7 @@ TARGETS: tuple[Target, ...] = (
     Target("hand_eye_json", "service.compute.poses.files.robot_files:read_hand_eye", _hand_eye, _hand_eyes, JSON),
     Target(
         "boxes_json",
-        "service.compute.markers.search.paper_files:read_boxes",
+        "service.compute.markers.paper:read_boxes",
         lambda data, folder: read_boxes(_put(folder, "boxes.json", data), [f"v{k}.jpg" for k in range(3)]),
         _box_files,
         JSON,

@@ -1,4 +1,4 @@
-"""Profiles across an outline, sampled through the lens distortion, and the edges on them."""
+"""Samples profiles across an outline through the lens distortion, and finds the edges on them."""
 
 from __future__ import annotations
 

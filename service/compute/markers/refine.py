@@ -1,16 +1,18 @@
-"""Outlines at full resolution by envelope edges, RANSAC and the limb's forward model, with their covariance."""
+"""Measures outlines at full resolution, in photographs or developed raw files, with their covariance."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.images.develop import coded, read_developed
 from service.compute.markers.cones import Cone, distance_gradient, ransac_cone
-from service.compute.markers.outlines.edges import (
+from service.compute.markers.edges import (
     FINER,
     Pixels,
     envelope_edges,
@@ -20,8 +22,7 @@ from service.compute.markers.outlines.edges import (
     sample_averaged,
     sample_sharp,
 )
-from service.compute.markers.outlines.limb import LimbFit, fit_limb, masked_median
-from service.compute.markers.outlines.limb_model import LimbProfiles
+from service.compute.markers.limb import LimbFit, LimbProfiles, fit_limb, masked_median
 from service.compute.markers.records import (
     DEFAULTS,
     DetectionOptions,
@@ -29,6 +30,7 @@ from service.compute.markers.records import (
     SphereOutline,
     outline_from_cone,
 )
+from service.core.errors import DataError
 from service.core.geometry import Array
 
 # Measured on rendered scenes with exact truth: an outline's remaining error after its noise has averaged out. It
@@ -381,3 +383,41 @@ def _median_colour(image: Pixels, middle: Array, reach: float) -> tuple[float, f
     b, g, r = np.median(image[y0 : y1 + 1 : step, x0 : x1 + 1 : step].reshape(-1, 3), axis=0)
     unit = 1 if image.dtype == np.uint8 else FINER
     return float(b) / unit, float(g) / unit, float(r) / unit
+
+
+def remeasure_file(
+    path: Path, camera: CameraModel, outlines: Sequence[SphereOutline], options: DetectionOptions = DEFAULTS
+) -> tuple[SphereOutline | None, ...]:
+    """`remeasure` in a TIFF that `develop` made.
+
+    Raises:
+        DataError: the file is none, or it is not of the camera's size.
+    """
+    linear = read_developed(path)
+    if linear.shape[:2] != (camera.height, camera.width):
+        raise DataError(
+            f"the developed picture has {linear.shape[1]}×{linear.shape[0]} pixels, "
+            f"the camera model is for {camera.width}×{camera.height}",
+            where=str(path),
+            remedy="Develop the raw file together with its JPEG, which gives it the JPEG's size",
+        )
+    return remeasure(coded(linear), camera, outlines, options)
+
+
+def remeasure(
+    coded_bgr: Pixels, camera: CameraModel, outlines: Sequence[SphereOutline], options: DetectionOptions = DEFAULTS
+) -> tuple[SphereOutline | None, ...]:
+    """The outlines that the JPEG showed, measured in another picture of the same exposure.
+
+    Args:
+        coded_bgr: (H, W, 3), sRGB coded: the noise is then about the same in shadows and lights, as the fit assumes.
+        camera: intrinsics.
+        outlines: found in the JPEG.
+        options: of the detector.
+
+    Returns:
+        One for each outline; None where this picture shows none there.
+    """
+    starts = [AveragedCone(outline.cone) for outline in outlines]
+    scores = [outline.score for outline in outlines]
+    return tuple(measure_outlines(coded_bgr, camera, starts, options, scores=scores))

@@ -1,9 +1,11 @@
-"""The paper's detector: boxes, masks of the colour channels, an ellipse by false pixels, Canny points, RANSAC."""
+"""Detects spheres as the paper does: boxes, masks of the colour channels, an ellipse, Canny points, RANSAC."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -11,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from service.compute.camera_model import CameraModel
+from service.compute.images.files import read_image_of
 from service.compute.markers.cones import Cone, angles_to, ransac_cone
-from service.compute.markers.outlines.candidates import find_candidates
 from service.compute.markers.records import (
     DEFAULTS,
     DetectionOptions,
@@ -20,7 +22,11 @@ from service.compute.markers.records import (
     SphereOutline,
     outline_from_cone,
 )
+from service.compute.markers.rough import find_candidates
+from service.core.errors import DataError
 from service.core.geometry import Array
+from service.core.text.file_text import file_text
+from service.core.text.json_text import parse_json
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
@@ -260,3 +266,62 @@ def _evidence(
 def _apart(a: SphereOutline, b: SphereOutline) -> bool:
     distance = np.arccos(np.clip(a.cone.axis @ b.cone.axis, -1, 1))
     return bool(distance > 0.5 * max(a.cone.half_angle_rad, b.cone.half_angle_rad))
+
+
+_FORM = 'Write {"image.jpg": [[left, top, right, bottom], …], …} in pixels of the image'
+
+
+def detect_file_by_masks(
+    path: Path,
+    camera: CameraModel,
+    options: DetectionOptions = DEFAULTS,
+    boxes: Mapping[str, Sequence[Box]] | None = None,
+) -> tuple[SphereOutline, ...]:
+    """The outlines in one image file by the paper's chain.
+
+    Args:
+        path: JPEG, PNG or TIFF of the camera's size.
+        camera: intrinsics.
+        options: of the detector.
+        boxes: (left, top, right, bottom) in pixels by file name; an image without an entry has no sphere. None: found
+            by circle votes.
+
+    Raises:
+        DataError: the file is not an image of the camera's size.
+    """
+    mine = None if boxes is None else boxes.get(path.name, ())
+    return detect_by_masks(read_image_of(path, camera), camera, options, boxes=mine)
+
+
+def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
+    """Boxes by image name from a JSON file, such as Grounding DINO's.
+
+    Raises:
+        DataError: the file is not JSON of this form, a box has no area, or an image is not among `names`.
+    """
+    data = parse_json(file_text(path), name=str(path), remedy=_FORM)
+    if not isinstance(data, dict):
+        raise DataError("the file does not hold boxes by image name", where=str(path), remedy=_FORM)
+    known = cast(dict[str, Any], data)
+    strange = sorted(set(known) - set(names))
+    if strange:
+        raise DataError(f"there is no image {strange[0]!r}", where=str(path), remedy=_FORM)
+    return {
+        name: [_box(entry, f"{path}: {name}") for entry in _list(entries, path)] for name, entries in known.items()
+    }
+
+
+def _list(entries: Any, path: Path) -> list[Any]:
+    if not isinstance(entries, list):
+        raise DataError("the boxes of an image are not a list", where=str(path), remedy=_FORM)
+    return cast(list[Any], entries)
+
+
+def _box(entry: Any, where: str) -> Box:
+    try:
+        left, top, right, bottom = (float(value) for value in entry)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{entry!r} is not a box", where=where, remedy=_FORM) from error
+    if not (left < right and top < bottom):  # NaN fails too
+        raise DataError(f"the box {entry!r} has no area", where=where, remedy=_FORM)
+    return left, top, right, bottom
