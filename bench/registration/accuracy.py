@@ -34,7 +34,7 @@ from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.compute.registration.cost import RegistrationSettings, residuals
 from service.compute.registration.pose_errors import with_joint_pose_covariance
 from service.compute.scene import PosedImages, ScanSpheres
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 
 

@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from service.compute.ground_truth.ply import read_ply
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.surface import Surface, read_ply
 from service.compute.memory import keep_freed_memory
 from service.core.records.events import ArtefactRef
 from service.core.units import metres

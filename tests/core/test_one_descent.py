@@ -21,8 +21,8 @@ OWN_LOOPS = {
     "poses/sfm/model/track_building.py": "reweights equations that are linear, for the start of a descent",
     "registration/solve.py": "whitens residuals, to reweight the next descent",
     "surfaces/loop_closure.py": "removes one outlier at a time, and tests each against a fit of the others",
-    "surfaces/spheres/rough_fits.py": "does the same for hundreds of candidates at once",
-    "surfaces/spheres/tukey.py": "shrinks the band of samples with the residuals",
+    "surfaces/sphere_candidates.py": "does the same for hundreds of candidates at once",
+    "surfaces/sphere_fit.py": "shrinks the band of samples with the residuals",
 }
 
 

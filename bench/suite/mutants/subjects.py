@@ -28,7 +28,8 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     ),
     "exporters": ("service/dataset/formats/**/*.py", "service/dataset/posed/exporter.py"),
     "fusion": (
-        "service/compute/ground_truth/fusion/*.py",
+        "service/compute/ground_truth/fuse.py",
+        "service/compute/ground_truth/overlap.py",
         "service/compute/ground_truth/align.py",
         "service/compute/surfaces/constellations.py",
     ),

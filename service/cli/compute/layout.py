@@ -14,9 +14,9 @@ from service.cli.common import JsonOption, console, print_json, print_table, rep
 from service.cli.compute.spheres import spheres_of
 from service.compute.images.files import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
+from service.compute.layout.moves import Move, suggest_moves
 from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph
 from service.compute.layout.photographs import layout_from_photographs
-from service.compute.layout.sphere_moves import Move, suggest_moves
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.core.errors import ComputeError

@@ -39,7 +39,7 @@ from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.poses.sfm.options import Effort, Refine, options_for
 from service.compute.scene import PosedImages, ScanSpheres
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
 from service.core.units import deg, metres, mm

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.distances.sampling import random_points
+from service.compute.ground_truth.chamfer import random_points
 from service.compute.ground_truth.surface import Surface
 from service.compute.matching.pairs.covisibility import LEAST_OVERLAP, Covisibility, covisibility, points_seen
 from service.compute.matching.pairs.listed import ListedPair, listed_pairs

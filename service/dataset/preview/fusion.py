@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.fusion.fuse import Source
-from service.compute.ground_truth.ply import read_ply
+from service.compute.ground_truth.distances import PointIndex
+from service.compute.ground_truth.fuse import Source
+from service.compute.ground_truth.surface import read_ply
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.units import metres

@@ -1,4 +1,4 @@
-"""Covariance of fitted sphere centres with noise correlated between neighbours, estimated from all residuals."""
+"""Estimates the covariance of fitted sphere centres whose noise is correlated between neighbours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import eigh, null_space
 from scipy.special import chdtri
 
-from service.compute.surfaces.spheres.fit import Patches
+from service.compute.surfaces.sphere_fit import Patches
 from service.core.geometry import Array
 
 LENGTHS = (0.08, 0.16, 0.28, 0.45, 0.75)  # correlation lengths that are tried, in radii

@@ -1,4 +1,4 @@
-"""Finds spheres of known radius in a scan, a CT mesh or a point cloud, and measures their centres."""
+"""Finds spheres of known radius in a scan, a CT mesh or a cloud, and says what is wrong where there are none."""
 
 from __future__ import annotations
 
@@ -10,14 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.compute.surfaces.spheres.candidates import candidates, vote_peaks
-from service.compute.surfaces.spheres.fit import SphereFit, SphereSamples, fit_sphere, sample_weights
-from service.compute.surfaces.spheres.noise import CentreUncertainty, centre_uncertainties
-from service.compute.surfaces.spheres.rough_fits import rough_centres
-from service.compute.surfaces.surfels import CHUNK, IntArray, Surfels, surfels
+from service.compute.surfaces.sphere_candidates import candidates, rough_centres, vote_peaks
+from service.compute.surfaces.sphere_fit import (
+    CHUNK,
+    IntArray,
+    SphereFit,
+    SphereSamples,
+    Surfels,
+    fit_sphere,
+    sample_weights,
+    surfels,
+)
+from service.compute.surfaces.sphere_noise import CentreUncertainty, centre_uncertainties
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
-from service.core.units import deg, mm
+from service.core.units import MISTAKEN_LENGTHS, deg, mm
 
 _SURFEL = 0.2  # surface cell over which normals are averaged, in radii
 _HOOD = 1.3  # radius around a centre that contains its sphere's surface, in radii
@@ -391,3 +398,104 @@ def _at_seeds(
         chosen.append(best)
     worth = _uncertainties(chosen, radius)
     return tuple(_sphere(fit, w) for fit, w in zip(chosen, worth, strict=True))
+
+
+# A search finds radii within 4 %. Half and twice: radius and diameter were confused.
+_TRIED = (0.95, 1.05, 0.9, 1.1, 0.85, 1.15, 0.8, 1.2, 0.75, 1.25, 0.7, 1.3, 0.5, 2.0)
+_LEAST_COVERAGE = 0.15  # of a sphere; smaller caps of any radius occur everywhere
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredRadius:
+    """The radius of the spheres in a mesh, and those spheres."""
+
+    radius_m: float
+    spheres: tuple[MeshSphere, ...]
+
+
+def seen_radius(
+    vertices_m: Array,
+    faces: NDArray[np.integer],
+    radius_m: float,
+    limits: SphereLimits | None = None,
+    *,
+    normals: Array | None = None,
+) -> MeasuredRadius | None:
+    """The radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
+
+    Takes as long as a dozen searches. Arguments as for `locate_spheres`; None if there are no such spheres.
+
+    Raises:
+        DataError: as `locate_spheres`.
+    """
+    best: tuple[MeshSphere, ...] = ()
+    nearest = radius_m
+    for factor in _TRIED:
+        found = _located(vertices_m, faces, factor * radius_m, limits, normals)
+        if _worth(found) > _worth(best):
+            best, nearest = found, factor * radius_m
+    if not best:
+        return None
+    for _ in range(2):  # the residual at a nearly correct radius is nearly the whole difference
+        nearest = nearest + float(np.median([sphere.radius_residual_m for sphere in best]))
+        again = _located(vertices_m, faces, nearest, limits, normals)
+        best = again if len(again) >= len(best) else best
+    return MeasuredRadius(nearest, best)
+
+
+def _located(
+    vertices_m: Array, faces: NDArray[np.integer], radius_m: float, limits: SphereLimits | None, normals: Array | None
+) -> tuple[MeshSphere, ...]:
+    try:
+        found = locate_spheres(vertices_m, faces, radius_m, None, limits, normals=normals)
+    except ComputeError:
+        return ()
+    return tuple(sphere for sphere in found if sphere.coverage > _LEAST_COVERAGE)
+
+
+def _worth(spheres: tuple[MeshSphere, ...]) -> tuple[int, float]:
+    return len(spheres), sum(sphere.coverage for sphere in spheres)
+
+
+_SCENE_M = (0.1, 3.0)  # diagonal of a scene with its spheres
+_LEAST_SPHERES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class WrongUnit:
+    """A mistaken unit that makes the spheres have their radius, with the coordinates multiplied by `factor`."""
+
+    factor: float
+    words: str
+    spheres: int
+
+
+def wrong_unit(vertices_m: Array, faces: NDArray[np.integer], radius_m: float) -> WrongUnit | None:
+    """The mistaken unit with the most spheres of the known radius.
+
+    Only those are tried that give the mesh the size of a scene, so that a mesh of that size takes no time.
+
+    Args:
+        vertices_m: (V, 3) as they were read.
+        faces: (F, 3).
+        radius_m: of the spheres.
+
+    Returns:
+        the mistake, or None if no other unit shows three spheres.
+    """
+    diagonal_m = float(np.linalg.norm(np.ptp(vertices_m, axis=0)))
+    low, high = _SCENE_M
+    if low <= diagonal_m <= high:
+        return None
+    best: WrongUnit | None = None
+    for words, factor in MISTAKEN_LENGTHS.items():
+        if not low <= factor * diagonal_m <= high:
+            continue
+        try:
+            found = locate_spheres(factor * vertices_m, faces, radius_m, None)
+        except ComputeError:
+            continue
+        count = sum(sphere.coverage > _LEAST_COVERAGE for sphere in found)
+        if count >= _LEAST_SPHERES and (best is None or count > best.spheres):
+            best = WrongUnit(factor, words, count)
+    return best

@@ -1,18 +1,19 @@
-"""Heat maps of distances: coloured vertices, and a picture of two surfaces side by side with a scale."""
+"""Shows distances as colours: at a mesh's vertices, and in pictures of surfaces and of a fusion."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.distances.chamfer import ChamferScore, DistanceSamples
-from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.sampling import normals_at
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.ground_truth.chamfer import ChamferScore, DistanceSamples, normals_at
+from service.compute.ground_truth.distances import PointIndex
+from service.compute.ground_truth.fuse import Fused, Source
+from service.compute.ground_truth.surface import IntArray, Surface, write_ply
 from service.core.geometry import Array
 from service.core.units import mm
 
@@ -227,3 +228,48 @@ def _bar(width: int, scale: HeatScale) -> Pixels:
         place = (x, _MARGIN_PX + _BAR_PX + 24)
         cv2.putText(out, text, place, *_FONT, _INK, 1, cv2.LINE_AA)
     return out
+
+
+def write_heat_mesh(
+    path: Path,
+    surface: Surface,
+    distance_m: Array,
+    scale: HeatScale,
+    metres_per_unit: float,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write a surface with, at each vertex, its distance in millimetres (`distance_mm`) and the colour of that.
+
+    Args:
+        path: of the file.
+        surface: metres.
+        distance_m: (V,); what lies beyond the limit of the scale may be infinite, and is written as the limit.
+        scale: of the colours.
+        metres_per_unit: unit of the file's coordinates, so that it lies over the file that was judged.
+        comments: further lines for the header, in ASCII.
+    """
+    colours = scale.colours(distance_m)
+    properties = {name: colours[:, k] for k, name in enumerate(("red", "green", "blue"))}
+    told = f"colours end at {mm(scale.full_m):g} mm; grey is beyond {mm(scale.outlier_m):g} mm"
+    distance_mm = mm(np.minimum(distance_m, scale.outlier_m))
+    write_ply(path, surface, metres_per_unit, {**properties, "distance_mm": distance_mm}, [told, *comments])
+
+
+_COLOURS = {Source.CT: (214, 94, 0), Source.SCAN: (0, 114, 178), Source.BLEND: (240, 228, 66)}  # red, green, blue
+_WORDS = {Source.CT: "CT orange", Source.SCAN: "scan blue", Source.BLEND: "blend yellow"}
+
+
+def fusion_picture(ct: Surface, scan: Surface, score: ChamferScore, scale: HeatScale, fused: Fused) -> bytes:
+    """A PNG with CT and scan by their distances, and the fused mesh by its sources, seen along one direction.
+
+    Args:
+        ct, scan: as they were compared, in one frame.
+        score: of the comparison.
+        scale: of its colours.
+        fused: of both.
+    """
+    palette = np.array([_COLOURS[source] for source in Source], dtype=np.uint8)
+    title = "source: " + ", ".join(f"{_WORDS[s]} {100 * fused.share(s):.0f} %" for s in Source)
+    sources = Panel(fused.surface.vertices_m, palette[fused.source], fused.surface.vertex_normals.__getitem__, title)
+    picture = heat_picture(ct, scan, score, scale, ("CT", "scan"), (sources,))
+    return cv2.imencode(".png", picture)[1].tobytes()
