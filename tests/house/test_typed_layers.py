@@ -41,7 +41,7 @@ EDGES = {
     "service/compute/capture/hand_bundle.py": "writes and reads the file of a hand-held image",
     "service/compute/markers/records.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
-    "service/compute/poses/files/camera_files.py": "reads JSON files",
+    "service/compute/poses/camera_files.py": "reads JSON files",
     "service/core/protocol/models.py": "the JSON schema of a protocol",
     "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",
@@ -52,9 +52,8 @@ EDGES = {
     "service/worker/capture/held_images.py": "writes and reads the file of a hand-held image",
     "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
-    "service/compute/poses/colmap/process.py": "messages of a child process",
-    "service/compute/poses/sfm/model/adjustment.py": "messages of a child process",
-    "service/compute/poses/sfm/model/mapping.py": "messages of a child process",
+    "service/compute/sfm/colmap_process.py": "messages of a child process",
+    "service/compute/sfm/mapping.py": "messages of a child process",
     # JSON that commands print
     "service/cli/compute/evaluate_chamfer.py": "prints JSON",
     "service/cli/compute/fuse.py": "prints JSON",

@@ -33,7 +33,6 @@ from service.cli.common import (
     require_writable,
     write_whole,
 )
-from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm_kinematics import active_tool, matching_arm, solve_joints
 from service.compute.board.board import Board
 from service.compute.board.next_poses import SuggestedPose, draw_board_plan, suggest_board_poses
@@ -46,13 +45,14 @@ from service.compute.hand_eye.reprojection import BoardCorners, board_corners
 from service.compute.hand_eye.setup import PoseReading, PosesAsRead, Setup
 from service.compute.images.folder import ImageFolder, image_folder
 from service.compute.intrinsics.estimate import locate_view
-from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.poses.files.pose_files import only_posed, posed_images
-from service.compute.poses.files.robot_poses import (
+from service.compute.poses.camera_files import read_camera_json
+from service.compute.poses.pose_files import only_posed, posed_images
+from service.compute.poses.robot_files import (
     RobotPoseTable,
     RotationForm,
     matched_rows,
     other_orders,
+    read_joints_csv,
     read_robot_poses,
 )
 from service.core.arms.known import arm_model

@@ -42,8 +42,8 @@ from service.compute.markers.image_files import (
 from service.compute.markers.paper import detect_file_by_masks, read_boxes
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.files.pose_files import posed_images
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
 from service.core.gates.verdict import describe_judged, judge

@@ -7,7 +7,7 @@ import math
 import struct
 from typing import Any
 
-from service.compute.poses.files.pose_files import OPENGL
+from service.compute.poses.pose_files import OPENGL
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
 from service.dataset.posed.records import DataSet, PosedView

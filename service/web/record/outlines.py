@@ -9,7 +9,7 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_from_record
-from service.compute.poses.files.camera_files import read_camera_json
+from service.compute.poses.camera_files import read_camera_json
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs.references import jobs_of

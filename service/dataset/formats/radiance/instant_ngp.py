@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.compute.poses.files.pose_files import OPENGL, transforms_intrinsics
+from service.compute.poses.pose_files import OPENGL, transforms_intrinsics
 from service.core.errors import DataError
 from service.dataset.formats.colmap.model import write_images
 from service.dataset.formats.radiance.nerfstudio import PINHOLE_REMEDY

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from service.compute.pixels.coding import DEPTH_UNIT_MM, coded_depth
-from service.compute.poses.files.pose_files import OPENGL, transforms_intrinsics
+from service.compute.poses.pose_files import OPENGL, transforms_intrinsics
 from service.core.units import metres
 from service.dataset.formats.colmap.model import write_images
 from service.dataset.formats.meshes import mask_png, png

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.compute.poses.files.pose_files import HALF_PIXEL
+from service.compute.poses.pose_files import HALF_PIXEL
 from service.dataset.formats.meshes import png
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter

@@ -20,7 +20,7 @@ from drivers.meshes.mesh_file import read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, taken_utc_s
 from service.compute.images.files import read_grey, read_image
-from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.import_folder import camera_record
 from service.store.events import canonical
 from service.web.record.pictures import reduced_jpeg
@@ -238,14 +238,14 @@ TARGETS: tuple[Target, ...] = (
     Target("dicom", "drivers.dicom_folder.folder:DicomFolder", _series, _slices, (*BYTES, *TEXT), pace=0.5),
     Target(
         "image_features",
-        "service.compute.poses.sfm.features:ImageFeatures.from_bytes",
+        "service.compute.sfm.features:ImageFeatures.from_bytes",
         lambda data, _: ImageFeatures.from_bytes(data),
         _features,
         says_place=False,
     ),
     Target(
         "image_matches",
-        "service.compute.poses.sfm.features:unpack_matches",
+        "service.compute.sfm.features:unpack_matches",
         lambda data, _: unpack_matches(data),
         _matches,
         says_place=False,

@@ -1,19 +1,23 @@
-"""The front end of structure from motion, image by image: features, and verified matches with earlier images."""
+"""Computes features and verified matches image by image, and stores them; later calls compute what is missing."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.colmap.process import ColmapProcess
-from service.compute.poses.sfm.features import ImageFeatures, PairMatches
-from service.compute.poses.sfm.options import Progress, SfmOptions
+from service.compute.sfm.colmap_process import ColmapProcess
+from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.sfm.options import Progress, SfmOptions
 from service.core.errors import DataError
 
 Item = TypeVar("Item")
@@ -177,3 +181,92 @@ def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatche
     """The pairs that have not been matched yet."""
     done = {m.pair for m in matches}
     return sorted({(min(pair), max(pair)) for pair in pairs} - done)
+
+
+@dataclass(frozen=True, slots=True)
+class CachedFrontEnd:
+    """Features and matches of one camera and one set of options.
+
+    Attributes:
+        workspace: existing folder in which they are kept.
+        camera: calibrated at the images' size.
+        settings: with which they are computed.
+        seconds: wall time of each stage that is run is written here.
+    """
+
+    workspace: Path
+    camera: CameraModel
+    settings: SfmOptions
+    seconds: dict[str, float]
+
+    def features(
+        self, files: Mapping[str, Path], front: FrontEnd, progress: Progress | None
+    ) -> dict[str, ImageFeatures]:
+        """Features of every image; those in the workspace are used if file, camera and settings are the same."""
+        folder = self.workspace / "features"
+        folder.mkdir(exist_ok=True)
+        kept = {name: folder / f"{_key(file, self.camera, self.settings)}.npz" for name, file in files.items()}
+        wanted = {name: files[name] for name, path in kept.items() if not path.is_file()}
+        start = time.monotonic()
+        fresh = front.extract_all(wanted, progress) if wanted else {}
+        if wanted:
+            self.seconds["extract"] = time.monotonic() - start
+        for name, found in fresh.items():
+            _write(kept[name], found.to_bytes())
+        return {
+            name: fresh[name] if name in fresh else ImageFeatures.from_bytes(kept[name].read_bytes())
+            for name in sorted(files)
+        }
+
+    def matches(
+        self,
+        features: Mapping[str, ImageFeatures],
+        pairs: Sequence[tuple[str, str]],
+        front: FrontEnd,
+        progress: Progress | None,
+    ) -> list[PairMatches]:
+        """Matches of exactly these pairs; those in the workspace are used if the features are the same."""
+        kept = self.workspace / "matches.npz"
+        stamp = self.workspace / "matches.json"
+        recipe = json.dumps(
+            [
+                dataclasses.asdict(self.camera),
+                self.settings.verification_error_px,
+                self.settings.seed,
+                _hash(features),
+            ]
+        )
+        known: list[PairMatches] = []
+        if kept.is_file() and stamp.is_file() and stamp.read_text(encoding="utf-8") == recipe:
+            known = unpack_matches(kept.read_bytes())
+        missing = missing_pairs(pairs, known)
+        if missing:
+            start = time.monotonic()
+            known += front.match_pairs(features, missing, progress)
+            self.seconds["match"] = time.monotonic() - start
+            stamp.unlink(missing_ok=True)
+            _write(kept, pack_matches(known))
+            stamp.write_text(recipe, encoding="utf-8")
+        wanted = set(pairs)
+        return [m for m in known if m.pair in wanted]
+
+
+def _hash(features: Mapping[str, ImageFeatures]) -> str:
+    digest = hashlib.sha256()
+    for name, found in features.items():
+        digest.update(name.encode() + found.pixels.tobytes() + found.descriptors.tobytes())
+    return digest.hexdigest()
+
+
+def _key(file: Path, camera: CameraModel, settings: SfmOptions) -> str:
+    stat = file.stat()
+    front = ("max_image_size", "max_features", "first_octave")
+    words = [str(file.resolve()), stat.st_size, stat.st_mtime_ns, camera.width, camera.height]
+    text = json.dumps([*words, *(getattr(settings, key) for key in front)])
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_suffix(".part")
+    part.write_bytes(data)
+    part.replace(path)

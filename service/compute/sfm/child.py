@@ -1,4 +1,4 @@
-"""The child process of structure from motion: runs pycolmap, with its output in a log file."""
+"""Runs pycolmap in the child process of structure from motion, with its output in a log file."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_grey
-from service.compute.poses.colmap.convention import from_colmap_pixels, to_colmap_camera, to_colmap_pixels
-from service.compute.poses.sfm.extraction import extract_sift
-from service.compute.poses.sfm.features import match_descriptors
-from service.compute.poses.sfm.model.mapping import map_images
-from service.compute.poses.sfm.options import Progress, reduction
+from service.compute.sfm.colmap import extract_sift, from_colmap_pixels, to_colmap_camera, to_colmap_pixels
+from service.compute.sfm.features import match_descriptors
+from service.compute.sfm.mapping import map_images
+from service.compute.sfm.options import Progress, reduction
 from service.core.errors import DataError, OrthocaptureError
 from service.core.geometry import Array
 

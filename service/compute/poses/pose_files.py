@@ -1,11 +1,13 @@
-"""Reads and writes camera poses: CSV, trajectories, transforms.json and COLMAP folders."""
+"""Reads and writes camera poses as CSV, trajectories, transforms.json and COLMAP folders; matches image names."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
+import re
+import unicodedata
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
 import numpy as np
@@ -13,11 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.folder import ImageFolder, strict_refusal
-from service.compute.poses.colmap import model_files as colmap_files
-from service.compute.poses.files.camera_files import finite_numbers, json_object
-from service.compute.poses.files.image_names import matched_names, some_names
-from service.compute.poses.files.trajectory import is_trajectory, trajectory_poses
-from service.core.delimited_text import read_table
+from service.compute.poses.camera_files import finite_numbers, json_object
+from service.compute.sfm import colmap_process as colmap_files
+from service.core.delimited_text import TextTable, is_number, read_table
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
 from service.core.text.file_text import csv_rows, file_bytes
@@ -326,3 +326,130 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
         where=str(folder),
         remedy="It must hold cameras, images and points3D (.bin or .txt)",
     )
+
+
+_COLUMNS = 8
+
+
+def is_trajectory(table: TextTable) -> bool:
+    """Whether a table has eight numbers in its first line, separated by spaces, and so no header and no names."""
+    if not table.rows or table.dialect.separator != " ":
+        return False
+    cells = table.rows[0].cells
+    return len(cells) == _COLUMNS and all(map(is_number, cells))
+
+
+def trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
+    """T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
+
+    Raises:
+        DataError: a line has another form, or a timestamp occurs twice; the message names file:line.
+    """
+    poses: dict[str, Transform] = {}
+    for row in table.rows:
+        where = f"{path}:{row.line}"
+        if len(row.cells) != _COLUMNS or not all(map(is_number, row.cells)):
+            raise DataError(
+                "the line is not timestamp tx ty tz qx qy qz qw, as those before it",
+                where=where,
+                remedy="Correct the line",
+            )
+        stamp, *rest = row.cells
+        values = np.array([float(cell) for cell in rest])
+        length = float(np.linalg.norm(values[3:]))
+        if not np.isfinite(values).all() or abs(length - 1) > _UNIT:
+            raise DataError(
+                f"the quaternion's length is {length:.4f}, not 1", where=where, remedy="Check the order qx qy qz qw"
+            )
+        if stamp in poses:
+            raise DataError(f"timestamp {stamp} has two poses", where=where, remedy="Remove one of them")
+        poses[stamp] = from_quaternion(values[:3], values[3:])
+    return poses
+
+
+# Matches the names of images in a table with the images of a folder, whatever program wrote it.
+#
+# Programs write paths of their own computer, with backslashes and drive letters, leave the extension out, and
+# change the case or the Unicode form of letters. A name that fits only one image that way is that image's; one that
+# fits several is refused.
+
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+_PICTURES = frozenset({
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm", ".webp", ".exr",
+    ".heic", ".heif", ".avif", ".jxl", ".jp2", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2",
+})  # fmt: skip
+_NAMED = 3
+
+
+def matched_names(images: Sequence[str], named: Collection[str], where: str, *, what: str = "pose") -> dict[str, str]:
+    """For each image that a file names, its name there.
+
+    Args:
+        images: names of image files.
+        named: the names in the file.
+        where: names the file in errors.
+        what: the file has of each image.
+
+    Raises:
+        DataError: a name in the file can be several images, or several names one image.
+    """
+    found = {image: image for image in images if image in named}
+    place = (where, what)
+    for key in (_file, _composed, _caseless):
+        _match(images, named, key, key, found, place)
+    bare = [name for name in named if PurePosixPath(_composed(name)).suffix.lower() not in _PICTURES]
+    for key in (_composed, _caseless):
+        _match(images, bare, lambda image, key=key: _stem(key(image)), key, found, place)
+    return found
+
+
+def _match(
+    images: Sequence[str],
+    named: Collection[str],
+    of_image: Callable[[str], str],
+    of_name: Callable[[str], str],
+    found: dict[str, str],
+    place: tuple[str, str],
+) -> None:
+    """Add the images whose key is that of one name; those that were found before do not count."""
+    used = set(found.values())
+    names: dict[str, list[str]] = {}
+    for name in named:
+        if name not in used:
+            names.setdefault(of_name(name), []).append(name)
+    alike: dict[str, list[str]] = {}
+    for image in images:
+        if image not in found and of_image(image) in names:
+            alike.setdefault(of_image(image), []).append(image)
+    for key, those in alike.items():
+        if len(those) > 1 or len(names[key]) > 1:
+            raise DataError(
+                f"it is not clear whose {place[1]} it is: {some_names(names[key])} can be {some_names(those)}",
+                where=place[0],
+                remedy="Name the images in the file as they are named in their folder",
+            )
+        found[those[0]] = names[key][0]
+
+
+def _file(name: str) -> str:
+    """The file's name without its folders, whichever system wrote the path."""
+    return PurePosixPath(_DRIVE.sub("", name.strip().replace("\\", "/"), count=1)).name
+
+
+def _composed(name: str) -> str:
+    """The file's name with composed letters: macOS stores ä as a and two dots."""
+    return unicodedata.normalize("NFC", _file(name))
+
+
+def _caseless(name: str) -> str:
+    return _composed(name).casefold()
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem
+
+
+def some_names(names: Sequence[str]) -> str:
+    """The first names of several, for messages."""
+    return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

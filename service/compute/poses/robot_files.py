@@ -1,14 +1,9 @@
-"""Reads the robot's poses as robots and their programs write them: rotation vectors, quaternions, angles, any unit.
-
-A table has a header or none, names of images or none, and positions before rotations. Three numbers of a rotation are
-a rotation vector in radians unless the header, their size or an option says otherwise; what an option would change
-is offered to the check of the poses against the images (`other_readings`), which names the one that fits.
-"""
+"""Reads what robots and their programs write: poses in any convention, joint angles, stations, T_flange_camera."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -16,11 +11,12 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.poses.files.image_names import matched_names
+from service.compute.poses.pose_files import matched_names
 from service.core.errors import DataError
-from service.core.geometry import Array
+from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
-from service.core.text.file_text import csv_rows
+from service.core.text.file_text import csv_rows, file_text
+from service.core.text.json_text import parse_json
 from service.core.units import METRES_PER, LengthUnit
 
 RotationForm = Literal[
@@ -306,3 +302,100 @@ _MAKE: dict[str, Callable[[Array], Rotation]] = {
     "xyz": lambda angles: Rotation.from_euler("XYZ", angles),
     "zyz": lambda angles: Rotation.from_euler("ZYZ", angles),
 }
+
+
+_REMEDY = "Give the file that `orthocapture calibrate hand-eye` wrote"
+
+
+def read_hand_eye(path: Path) -> Transform:
+    """T_flange_camera (4, 4), metres, from a hand_eye.json.
+
+    Raises:
+        DataError: the file holds no valid T_flange_camera.
+    """
+    document = parse_json(file_text(path), name=str(path), remedy=_REMEDY)
+    try:
+        T_flange_camera = np.array(document["T_flange_camera"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise DataError("no T_flange_camera can be read", where=str(path), remedy=_REMEDY) from error
+    if T_flange_camera.shape != (4, 4) or not np.isfinite(T_flange_camera).all():
+        raise DataError("T_flange_camera is not 4 × 4 finite numbers", where=str(path), remedy=_REMEDY)
+    return T_flange_camera
+
+
+def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
+    """Station by image name, from a CSV with the columns image and station.
+
+    Raises:
+        DataError: the columns are missing, or an image has no station.
+    """
+    rows = csv_rows(path)
+    header = [cell.strip() for cell in next(rows, (1, []))[1]]
+    if not {"image", "station"} <= set(header):
+        raise DataError("no columns image and station", where=f"{path}:1", remedy="Begin the file with image,station")
+    image, station = header.index("image"), header.index("station")
+    found: dict[str, str] = {}
+    for line, row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) <= max(image, station):
+            raise DataError("the line has no image or no station", where=f"{path}:{line}", remedy="Correct the line")
+        found[row[image].strip()] = row[station].strip()
+    wanted = list(images)
+    names = matched_names(wanted, found, str(path), what="station")
+    missing = sorted(set(wanted) - set(names))
+    if missing:
+        raise DataError(
+            f"no station for {counted(len(missing), 'image')}: {', '.join(missing[:5])}",
+            where=str(path),
+            remedy="Add their lines",
+        )
+    return {image: found[name] for image, name in names.items()}
+
+
+_AXES = range(1, 17)  # no arm has more
+_LARGEST_RAD = 4 * np.pi  # beyond any arm's range: the file is in degrees
+
+
+def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
+    """Joints (N,) in radians by image name; N is the number of columns q1, q2, …
+
+    Raises:
+        DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.
+    """
+    rows = csv_rows(path)
+    header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
+    axes = len(header) - 1
+    if axes not in _AXES or header != ("image", *(f"q{k}" for k in range(1, axes + 1))):
+        raise DataError(
+            f"the first line is {','.join(header)!r}",
+            where=f"{path}:1",
+            remedy="It must be image,q1,q2,… with a column for each of the arm's axes",
+        )
+    joints: dict[str, Array] = {}
+    for line, row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        where = f"{path}:{line}"
+        try:
+            values = np.array([float(cell) for cell in row[1:]])
+        except ValueError:
+            raise DataError("a field is not a number", where=where, remedy="Correct the line") from None
+        if values.shape != (axes,) or not np.isfinite(values).all():
+            raise DataError(f"not {axes} finite numbers after the name", where=where, remedy="Correct the line")
+        if np.abs(values).max() > _LARGEST_RAD:
+            raise DataError(
+                f"{np.abs(values).max():.0f} rad is not a joint angle", where=where, remedy="Write radians"
+            )
+        if row[0].strip() in joints:
+            raise DataError(f"image {row[0].strip()} has two rows", where=where, remedy="Remove one of them")
+        joints[row[0].strip()] = values
+    names = matched_names(images, joints, str(path), what="row of joints")
+    missing = [image for image in images if image not in names]
+    if missing:
+        raise DataError(
+            f"no joints for {counted(len(missing), 'image')}: {', '.join(missing[:5])}",
+            where=str(path),
+            remedy="Add their rows, or leave the images out",
+        )
+    return {image: joints[names[image]] for image in images}
