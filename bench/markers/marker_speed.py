@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from bench.machine import RESULTS, machine
 from bench.scenes import rendered
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image, read_reduced
+from service.compute.images.photographs import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.image_files import ANCHOR_WIDTH_PX
 from service.compute.markers.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of

@@ -29,7 +29,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.develop import coded, develop
 from service.compute.images.develop_parameters import PARAMETERS, DevelopParameters
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline

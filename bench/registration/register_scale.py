@@ -24,7 +24,7 @@ import numpy as np
 
 from bench.machine import RESULTS, machine
 from bench.scenes import rendered
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.pipeline import register_images
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json

@@ -14,7 +14,7 @@ from service.compute.ground_truth.fuse import compact
 from service.compute.ground_truth.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.overlap import Box
 from service.compute.ground_truth.surface import Surface, write_ply
-from service.compute.memory import large_arrays_returned
+from service.compute.resources import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm

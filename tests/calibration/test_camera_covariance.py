@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
-from service.compute.camera_model import CameraModel
+from service.compute.camera_model import CameraCovariance, CameraModel, read_camera_covariance
 from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.hand_eye.reprojection import BoardCorners
 from service.compute.hybrid.bundle import AdjustmentData, BundleState, Sigmas, linearise, moved, normal_equations

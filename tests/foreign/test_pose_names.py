@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.images.folder import ImageFolder
+from service.compute.images.photographs import ImageFolder
 from service.compute.poses.pose_files import posed_images, read_poses
 from service.core.errors import DataError
 

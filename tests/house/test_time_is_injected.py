@@ -28,7 +28,7 @@ SERVICE = {
     "service/benchmark/programs/measured.py": "measures how long a program took",
     "service/cli/evidence/audit.py": "measures how long a verification took, and says when it was",
     "service/cli/run/demo.py": "measures how long the demonstration took",
-    "service/compute/matching/scores/evaluate.py": "measures how long a pair of images took",
+    "service/compute/matching/scores.py": "measures how long a pair of images took",
     "service/compute/sfm/estimate.py": "measures how long a reconstruction took",
     "service/compute/sfm/front_end.py": "measures how long a reconstruction took",
     "service/web/monitoring/request_counts.py": "measures how long a page took",

@@ -38,7 +38,7 @@ EDGES = {
     "service/store/verification/signature_checks.py": "checks rows that may be altered and no longer records",
     "service/audit/verify/bundle_verifier.py": "stands alone in a bundle, with nothing but the standard library",
     # files
-    "service/compute/capture/hand_bundle.py": "writes and reads the file of a hand-held image",
+    "service/compute/hand_held.py": "writes and reads the file of a hand-held image",
     "service/compute/markers/records.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
     "service/compute/poses/camera_files.py": "reads JSON files",

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.evaluation.accuracy import true_error_m
-from service.compute.images.files import read_image, read_reduced
+from service.compute.images.photographs import read_image, read_reduced
 from service.compute.markers.cones import ObservedCones, cone_of_sphere, fit_pose
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.image_files import LocatedOutlines, detect_all, locate_outlines, spread_views

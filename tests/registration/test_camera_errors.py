@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.matching.pairs.relative_pose import relative_covariance, relative_pose
+from service.compute.matching.pairs import relative_covariance, relative_pose
 from service.compute.registration.cost import CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment
 from service.compute.registration.pose_errors import camera_errors

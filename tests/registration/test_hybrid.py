@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.camera_covariance import CameraCovariance
+from service.compute.camera_model import CameraCovariance
 from service.compute.hybrid.bundle import (
     AdjustmentData,
     BundleState,

@@ -17,7 +17,7 @@ import pytest
 from drivers.interfaces import CameraSettings
 from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm_kinematics import postures
-from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
+from service.compute.live import LiveView, clipped_fraction, register_station, sharpness
 from service.compute.markers.predicted import NEAR, ImageOutlines, PredictedSpheres, find_outlines, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,

@@ -15,7 +15,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "verifier": ("service/store/verification/*.py", "service/audit/verify/bundle_verifier.py"),
     "cost": tuple(f"service/compute/registration/{name}.py" for name in ("cost", "problem", "solve")),
     "covariances": (
-        "service/compute/camera_covariance.py",
+        "service/compute/camera_model.py",
         "service/compute/registration/pose_errors.py",
         "service/compute/registration/result.py",
         "service/compute/registration/further_camera.py",

@@ -13,7 +13,7 @@ from pathlib import Path
 import pycolmap
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_grey
+from service.compute.images.photographs import read_grey
 from service.compute.poses.pose_files import HALF_PIXEL
 from service.compute.stereo.rectify import StereoView
 from service.core.errors import ComputeError, DataError, OrthocaptureError

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.benchmark.programs.colmap import views_of
 from service.compute.ground_truth.surface import write_ply
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.poses.pose_files import HALF_PIXEL
 from service.compute.stereo.fusion import fused, surface_of
 from service.compute.stereo.matching import DepthMap

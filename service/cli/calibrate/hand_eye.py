@@ -37,13 +37,12 @@ from service.compute.arm_kinematics import active_tool, matching_arm, solve_join
 from service.compute.board.board import Board
 from service.compute.board.next_poses import SuggestedPose, draw_board_plan, suggest_board_poses
 from service.compute.board.search import UsableViews
-from service.compute.camera_covariance import read_camera_covariance
-from service.compute.camera_model import CameraModel
+from service.compute.camera_model import CameraModel, read_camera_covariance
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.compute.hand_eye.fit import Method
 from service.compute.hand_eye.reprojection import BoardCorners, board_corners
 from service.compute.hand_eye.setup import PoseReading, PosesAsRead, Setup
-from service.compute.images.folder import ImageFolder, image_folder
+from service.compute.images.photographs import ImageFolder, image_folder
 from service.compute.intrinsics.estimate import locate_view
 from service.compute.poses.camera_files import read_camera_json
 from service.compute.poses.pose_files import only_posed, posed_images

@@ -35,8 +35,7 @@ from service.cli.common import (
     write_whole,
 )
 from service.compute.board.search import UsableViews
-from service.compute.images.files import image_size
-from service.compute.images.folder import image_folder
+from service.compute.images.photographs import image_folder, image_size
 from service.compute.intrinsics.adjustment import LensModel
 from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
 from service.compute.intrinsics.optics import Optics, compare_optics, states_focus, summary

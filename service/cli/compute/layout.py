@@ -12,7 +12,7 @@ from rich.table import Table
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
 from service.cli.compute.spheres import spheres_of
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
 from service.compute.layout.moves import Move, suggest_moves
 from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph

@@ -25,9 +25,9 @@ from service.cli.common import (
     write_whole,
 )
 from service.cli.compute.spheres import SeedsOption, spheres_of
-from service.compute.camera_covariance import read_camera_covariance
+from service.compute.camera_model import read_camera_covariance
 from service.compute.evaluation.control_spheres import LEAST_SHARE, MOST_WORST_MM, ExpectedNearby
-from service.compute.images.folder import image_folder
+from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for
 from service.compute.markers.grounded import GroundedDetector
 from service.compute.markers.grounded_networks import VARIABLE, weights_in

@@ -28,9 +28,9 @@ from service.cli.common import (
     tell_left_out,
     write_whole,
 )
-from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
+from service.compute.camera_model import CameraCovariance, read_camera_covariance
 from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
-from service.compute.images.folder import image_folder
+from service.compute.images.photographs import image_folder
 from service.compute.markers.image_files import detect_all
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.pose_files import read_poses_csv, write_poses_csv

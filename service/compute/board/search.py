@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from service.compute.board.board import Board, BoardView, Grey, find_board, half_window, refine_corners
 from service.compute.board.diagnosis import Diagnosis, diagnose, wrong_board
 from service.compute.board.knowledge import BoardKnowledge
-from service.compute.images.files import read_grey
+from service.compute.images.photographs import read_grey
 from service.compute.intrinsics.adjustment import fit_pose, pose_matrix, start_pose
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.compute.arm_correction import ArmCorrection
 from service.compute.board.board import Board
-from service.compute.camera_covariance import CameraCovariance
+from service.compute.camera_model import CameraCovariance
 from service.compute.hand_eye.fit import (
     ArmTerms,
     HandEyeMeasurements,

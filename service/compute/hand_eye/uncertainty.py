@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.board.board import Board, BoardView
-from service.compute.camera_covariance import CameraCovariance
-from service.compute.camera_model import CameraModel
+from service.compute.camera_model import CameraCovariance, CameraModel
 from service.compute.hand_eye.fit import HandEyeMeasurements, HandEyeSolution, Method, fit_resized
 from service.compute.hand_eye.reprojection import BoardCorners, resample_reprojection
 from service.compute.hand_eye.setup import CLOSED_FORMS, solve_closed_form

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.camera_covariance import CameraCovariance
-from service.compute.camera_model import CameraModel
+from service.compute.camera_model import CameraCovariance, CameraModel
 from service.compute.hybrid.adjustment import BundleSolution, solve
 from service.compute.hybrid.bundle import (
     AdjustmentData,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image_of
+from service.compute.images.photographs import read_image_of
 from service.compute.markers.cones import Cone, cones_through, fit_cone
 from service.compute.markers.detect import confirmed_outlines, detect_spheres
 from service.compute.markers.grounded_networks import DEVIATION, MEAN, Floats, Networks, Weights, load_networks

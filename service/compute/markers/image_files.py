@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image_of, read_reduced
+from service.compute.images.photographs import read_image_of, read_reduced
 from service.compute.markers.cones import Cone, ObservedCones, cone_of_sphere, fit_pose
 from service.compute.markers.detect import detect_spheres, find_rough
 from service.compute.markers.predicted import (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image_of
+from service.compute.images.photographs import read_image_of
 from service.compute.markers.cones import Cone, angles_to, ransac_cone
 from service.compute.markers.records import (
     DEFAULTS,

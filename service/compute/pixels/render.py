@@ -1,22 +1,17 @@
-"""Depth and normals of a mesh as a camera sees it, in tiles of rows, so that 60 million pixels need little memory.
-
-Works for distorted cameras and for undistorted ones: the depth of a pixel is that of the ray through its centre under
-the camera that is given. embreex finds the first face; depth and normal come from that face's plane in double
-precision, so they are as exact as the mesh.
-"""
+"""Renders a mesh's depth and normals as a camera sees them, and says which points of a surface views see."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.rays import PixelRays, pixel_rays
-from service.core.geometry import Transform
+from service.compute.pixels.rays import PixelRays, RayMesh, pixel_rays
+from service.core.geometry import Array, Transform, apply, inverse
 
 Float32s = NDArray[np.float32]
 
@@ -111,3 +106,49 @@ def depth_map(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) 
     for rows in seen_rows(surface, camera, T_world_camera):
         depth[rows.first : rows.first + len(rows.depth_m)] = rows.depth_m
     return depth
+
+
+_TOLERANCE_M = 1e-3  # a point so far behind the depth of its pixel is still on the surface that is seen
+
+
+def seen_points(
+    points_m: Array, camera: CameraModel, T_world_camera: Transform, depth_m: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
+
+    Args:
+        points_m: on the surface that the depth is of.
+        camera: of the depth.
+        T_world_camera: (4, 4) of the view.
+        depth_m: (H, W) z of the surface; 0 where none is seen.
+    """
+    before = apply(inverse(T_world_camera), points_m)
+    with np.errstate(all="ignore"):
+        pixels = camera.project(before)
+    inside = (before[:, 2] > 0) & np.isfinite(pixels).all(axis=1)
+    inside &= ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
+    # On a steep surface the depth of the pixel's centre differs from that of the point: the deepest neighbour counts.
+    deepest = cv2.dilate(depth_m, np.ones((3, 3), np.uint8))
+    column, row = np.rint(pixels[inside]).astype(np.int64).T
+    seen = np.zeros(len(points_m), dtype=np.bool_)
+    seen[inside] = before[inside, 2] <= deepest[row, column] + _TOLERANCE_M
+    return seen
+
+
+def covered_shares(
+    counts: NDArray[np.int64], points_m: Array, triangles: NDArray[np.int64], at_least: Sequence[int]
+) -> tuple[float, ...]:
+    """Share of a mesh's area that at least so many views see, for each number in `at_least`.
+
+    Args:
+        counts: (V,) views that see each vertex.
+        points_m: (V, 3) vertices.
+        triangles: (F, 3); a third of each belongs to each of its corners.
+        at_least: numbers of views.
+    """
+    a, b, c = (points_m[triangles[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    weight = np.zeros(len(points_m))
+    np.add.at(weight, triangles.ravel(), np.repeat(area / 6, 3))
+    whole = max(float(weight.sum()), 1e-300)
+    return tuple(float(weight[counts >= least].sum()) / whole for least in at_least)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.folder import ImageFolder, strict_refusal
+from service.compute.images.photographs import ImageFolder, strict_refusal
 from service.compute.poses.camera_files import finite_numbers, json_object
 from service.compute.sfm import colmap_process as colmap_files
 from service.core.delimited_text import TextTable, is_number, read_table

@@ -14,7 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_grey
+from service.compute.images.photographs import read_grey
 from service.compute.sfm.colmap import extract_sift, from_colmap_pixels, to_colmap_camera, to_colmap_pixels
 from service.compute.sfm.features import match_descriptors
 from service.compute.sfm.mapping import map_images

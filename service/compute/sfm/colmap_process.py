@@ -20,7 +20,7 @@ from typing import Any, Self, cast
 
 import psutil
 
-from service.compute.memory import keep_freed_memory
+from service.compute.resources import keep_freed_memory
 from service.compute.sfm.options import Progress
 from service.core.errors import ComputeError, DataError, OrthocaptureError
 from service.core.geometry import Transform

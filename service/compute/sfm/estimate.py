@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.camera_covariance import CameraCovariance
-from service.compute.camera_model import CameraModel
+from service.compute.camera_model import CameraCovariance, CameraModel
 from service.compute.hybrid.adjustment import clustered_information, first_guess, robust_rows
 from service.compute.hybrid.bundle import AdjustmentData, BundleState, Rows, Sigmas, linearise, normal_equations
 from service.compute.sfm.colmap_process import ColmapProcess

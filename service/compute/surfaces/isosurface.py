@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
-from service.compute.memory import forget_pages
+from service.compute.resources import forget_pages
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from service.compute.pixels.coverage import seen_points
-from service.compute.pixels.crops import marker_free_crops
+from service.compute.pixels.render import seen_points
+from service.compute.pixels.views import marker_free_crops
 from service.core.errors import ComputeError, DataError
 from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
 from service.dataset.posed.records import DataSet

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.crops import FULL_HD, ImageCrop, marker_free_crops
+from service.compute.pixels.views import FULL_HD, ImageCrop, marker_free_crops
 from service.core.errors import DataError
 from service.core.units import mm
 from service.dataset.posed.records import DataSet, Pixels, PosedView

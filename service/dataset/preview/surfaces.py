@@ -13,7 +13,7 @@ from service.compute.ground_truth.chamfer import ChamferSettings, chamfer, sampl
 from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.surface import Surface
-from service.compute.pixels.coverage import covered_shares
+from service.compute.pixels.render import covered_shares
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform

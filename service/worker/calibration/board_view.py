@@ -10,8 +10,7 @@ import numpy as np
 from service.compute.board.board import Board, BoardView, find_board
 from service.compute.board.knowledge import BoardKnowledge
 from service.compute.board.search import BoardImage, find_boards, with_parts
-from service.compute.images.files import read_grey
-from service.compute.images.quality import image_quality
+from service.compute.images.photographs import image_quality, read_grey
 from service.core.errors import ComputeError
 from service.jobs.calibration import board_view as job
 from service.jobs.calibration import calibrate as calibrate_job

@@ -24,17 +24,17 @@ from service.compute.evaluation.error_budget import (
     locate_in_images,
     loop_observations,
 )
-from service.compute.images.files import read_image
-from service.compute.images.resolution import resample
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.images.photographs import read_image
 from service.compute.markers.cones import Cone
 from service.compute.markers.detect import options_for
 from service.compute.markers.image_files import search_nearby
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, Detection, draw_overlay
+from service.compute.pixels.resample import resample
 from service.compute.registration.common_errors import UNEXPLAINED
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.compute.registration.identity import Assignment
+from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError

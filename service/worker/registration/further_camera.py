@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
-from service.compute.camera_model import CameraModel
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.camera_model import CameraCovariance, CameraModel, read_camera_covariance
 from service.compute.markers.detect import options_for
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
@@ -25,6 +23,7 @@ from service.compute.registration.further_camera import (
     sighted_pose,
 )
 from service.compute.registration.pose_errors import of_inverse, of_product
+from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.compute.markers.detect import options_for
 from service.compute.markers.grounded import GroundedDetector
 from service.compute.markers.grounded_networks import Weights, weights_in
@@ -16,6 +15,7 @@ from service.compute.markers.image_files import LocatedOutlines, detect_all, loc
 from service.compute.markers.paper import detect_file_by_masks
 from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
 from service.compute.markers.refine import remeasure_file
+from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.jobs.poses.structure_from_motion import ModelFile

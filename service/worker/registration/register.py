@@ -11,9 +11,9 @@ from functools import partial
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.capture.located import poses_by_spheres
 from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.error_budget import Alignment
+from service.compute.hand_held import poses_by_spheres
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, PipelineResult, register_images
 from service.compute.registration.common_errors import UNEXPLAINED, held_lens_covariance

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import (
     REQUIRED_MARGIN_M,
     LayoutReport,

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
-from service.compute.memory import large_arrays_returned
+from service.compute.resources import large_arrays_returned
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import (
     LEAST_CONTRAST_HU,

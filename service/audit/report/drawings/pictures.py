@@ -6,7 +6,7 @@ import cv2
 
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Picture
-from service.compute.images.shown import decode_reduced
+from service.compute.images.photographs import decode_reduced
 from service.core.errors import DataError, IntegrityError
 
 THUMBNAIL_PX = 240

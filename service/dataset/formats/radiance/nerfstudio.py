@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.compute.pixels.coding import DEPTH_UNIT_MM, coded_depth
+from service.compute.pixels.views import DEPTH_UNIT_MM, coded_depth
 from service.compute.poses.pose_files import OPENGL, transforms_intrinsics
 from service.core.units import metres
 from service.dataset.formats.colmap.model import write_images

@@ -19,7 +19,7 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, taken_utc_s
-from service.compute.images.files import read_grey, read_image
+from service.compute.images.photographs import read_grey, read_image
 from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.import_folder import camera_record
 from service.store.events import canonical
@@ -220,7 +220,7 @@ TARGETS: tuple[Target, ...] = (
         lambda data, folder: check_jpeg_complete(_put(folder, "DSC00007.JPG", data)),
         _jpegs,
     ),
-    Target("image", "service.compute.images.files:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
+    Target("image", "service.compute.images.photographs:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
     Target("web_picture", "service.web.record.pictures:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
     Target("mesh_ply", "drivers.meshes.mesh_file:read_mesh_file", _mesh("ply"), _plys, (*BYTES, *TEXT)),
     Target("mesh_stl", "drivers.meshes.mesh_file:read_mesh_file", _mesh("stl"), _stls, (*BYTES, *TEXT)),

@@ -20,9 +20,7 @@ from service.benchmark.methods import from_unit_box, methods
 from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Score, read_results
 from service.benchmark.table import table_markdown
 from service.compute.ground_truth.surface import Surface, read_ply, write_ply
-from service.compute.matching.scores.evaluate import LoadedViews, PairScore
-from service.compute.matching.scores.matches import PRECISION_PX
-from service.compute.matching.scores.pose import PoseError
+from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
 from service.core.text.json_text import parse_json
 from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.folder import SUMS

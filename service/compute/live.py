@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.quality import image_quality
+from service.compute.images.photographs import image_quality
 from service.compute.markers.edges import profiles, sample
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.hypotheses import paired

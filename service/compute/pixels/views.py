@@ -1,15 +1,67 @@
-"""Crops of an image that show the specimen and no marker, with the cameras that belong to them."""
+"""Splits a data set's views, crops them to the specimen, and codes their depth as 16-bit images."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, DataError
+from service.core.units import metres, mm
+
+SPARSE_VIEWS = 8
+TEST_EVERY = 8  # as in LLFF and 3D Gaussian splatting
+
+
+@dataclass(frozen=True, slots=True)
+class Splits:
+    """Names of views: `dense` is all, `sparse` a few that see the specimen best; train and test share none."""
+
+    dense: tuple[str, ...]
+    sparse: tuple[str, ...]
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+
+    def named(self) -> dict[str, tuple[str, ...]]:
+        """The splits by name."""
+        return {"dense": self.dense, "sparse": self.sparse, "train": self.train, "test": self.test}
+
+
+def splits(sees: Mapping[str, NDArray[np.bool_]], sparse_views: int = SPARSE_VIEWS) -> Splits:
+    """Splits of views, each with the points (N,) of the specimen that it sees.
+
+    Raises:
+        DataError: there is no view.
+    """
+    names = tuple(sorted(sees))
+    if not names:
+        raise DataError("a data set needs at least one view", remedy="Export a run with registered images")
+    test = names[TEST_EVERY // 2 :: TEST_EVERY]
+    train = tuple(name for name in names if name not in set(test))
+    return Splits(names, sparse_choice(names, [sees[name] for name in names], sparse_views), train, test)
+
+
+def sparse_choice(names: Sequence[str], sees: Sequence[NDArray[np.bool_]], count: int) -> tuple[str, ...]:
+    """The `count` views that see most together, in the order of `names`; of equal choices the first.
+
+    A point counts fully for the first view that sees it, half for the second, a quarter for the third: reconstruction
+    needs two views of a point, and further ones help less. Chosen one after the other, which is within 63 % of the
+    best choice (Nemhauser, Wolsey, Fisher, 1978).
+    """
+    seen, worth = np.array(sees, dtype=np.float64), np.ones(len(sees[0]))
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(names)):
+        gain = seen @ worth
+        gain[chosen] = -1.0
+        best = int(gain.argmax())
+        chosen.append(best)
+        worth *= np.where(sees[best], 0.5, 1.0)
+    return tuple(names[i] for i in sorted(chosen))
+
 
 FULL_HD = (1920, 1080)
 _CELL_PX = 8  # crops begin at multiples of this
@@ -91,3 +143,25 @@ def _window_sums(cells: NDArray[np.int64], window: tuple[int, int], places: tupl
     (h, w), (rows, columns) = window, places
     top, bottom = total[:rows], total[h : h + rows]
     return (bottom[:, w : w + columns] - bottom[:, :columns]) - (top[:, w : w + columns] - top[:, :columns])
+
+
+DEPTH_UNIT_MM = 0.1
+_MOST = 65535
+
+
+def coded_depth(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """(H, W) whole numbers of 0.1 mm, rounded; 0 where there is no depth.
+
+    Raises:
+        DataError: a depth is beyond 6.5535 m.
+    """
+    deepest_mm = mm(float(depth_m.max(initial=0.0)))
+    if deepest_mm > _MOST * DEPTH_UNIT_MM:
+        raise DataError(
+            f"a depth of {metres(deepest_mm):.2f} m does not fit into 16 bits in units of {DEPTH_UNIT_MM} mm",
+            remedy="Write this depth as float32, or remove far surfaces from the mesh",
+        )
+    coded = np.empty(depth_m.shape, dtype=np.uint16)
+    for row in range(0, len(depth_m), 256):
+        coded[row : row + 256] = np.rint(depth_m[row : row + 256] * np.float64(mm(1.0) / DEPTH_UNIT_MM))
+    return coded
