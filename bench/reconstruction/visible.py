@@ -21,7 +21,7 @@ from bench.reconstruction.simulated import simulated_data_set
 from bench.scenes import CACHE, render_scene
 from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.surface import IntArray, Surface
-from service.compute.pixels.rays import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm
 from service.dataset.posed.records import DataSet

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.ground_truth.surface import Surface
-from service.compute.pixels.rays import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.compute.stereo.rectify import StereoView
 from service.compute.stereo.steep import (
     averaged,

@@ -20,7 +20,7 @@ OWN_LOOPS = {
     "hybrid/estimate.py": "solves once for each camera, and iterates nothing",
     "sfm/track_building.py": "reweights equations that are linear, for the start of a descent",
     "registration/solve.py": "whitens residuals, to reweight the next descent",
-    "surfaces/loop_closure.py": "removes one outlier at a time, and tests each against a fit of the others",
+    "surfaces/constellations.py": "removes one outlier at a time, and tests each against a fit of the others",
     "surfaces/sphere_candidates.py": "does the same for hundreds of candidates at once",
     "surfaces/sphere_fit.py": "shrinks the band of samples with the residuals",
 }

@@ -53,7 +53,7 @@ EDGES = {
     "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/sfm/colmap_process.py": "messages of a child process",
-    "service/compute/sfm/mapping.py": "messages of a child process",
+    "service/compute/sfm/child.py": "messages of a child process",
     # JSON that commands print
     "service/cli/compute/evaluate_chamfer.py": "prints JSON",
     "service/cli/compute/fuse.py": "prints JSON",

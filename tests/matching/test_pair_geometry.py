@@ -21,8 +21,7 @@ from service.compute.matching.pairs import (
     relative_covariance,
     relative_pose,
 )
-from service.compute.pixels.rays import RayMesh
-from service.compute.pixels.render import depth_map
+from service.compute.pixels.render import RayMesh, depth_map
 from service.core.geometry import Array, Transform, apply, increment, inverse, look_at
 from tests.support.scenes.posed import UP, reach, scene
 

@@ -24,8 +24,7 @@ from service.compute.matching.scores import (
     pose_from_matches,
     precisions,
 )
-from service.compute.pixels.rays import RayMesh
-from service.compute.pixels.render import depth_map
+from service.compute.pixels.render import RayMesh, depth_map
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at
 from tests.support.scenes.posed import UP, scene

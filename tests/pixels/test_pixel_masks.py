@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask, posts_below
-from service.compute.pixels.rays import RayMesh, pixel_rays
-from service.compute.pixels.render import depth_map, seen
+from service.compute.pixels.render import RayMesh, depth_map, pixel_rays, seen
 from service.compute.pixels.resample import pinhole_of, undistorted
 from service.compute.pixels.views import ImageCrop, marker_free_crops, splits
 from service.core.errors import ConfigurationError, DataError

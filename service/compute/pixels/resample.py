@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.rays import pixel_rays
+from service.compute.pixels.render import pixel_rays
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from service.compute.ground_truth.surface import Surface
-from service.compute.pixels.rays import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.compute.resources import return_freed_memory
 from service.compute.stereo.fusion import fused, surface_of
 from service.compute.stereo.matching import DepthMap, depth_of_pair, guided_depth

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.surface import Surface
-from service.compute.pixels.rays import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.compute.stereo.rectify import StereoView
 from service.core.geometry import Array, apply, inverse
 

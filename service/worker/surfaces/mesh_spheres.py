@@ -9,7 +9,7 @@ import numpy as np
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.resources import large_arrays_returned
-from service.compute.surfaces.constellations import match_constellations
+from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
 from service.compute.surfaces.isosurface import (
     LEAST_CONTRAST_HU,
     cut_voxels,
@@ -17,7 +17,6 @@ from service.compute.surfaces.isosurface import (
     sphere_contrasts,
     surface,
 )
-from service.compute.surfaces.loop_closure import LoopClosure, close_loop
 from service.compute.surfaces.mesh_spheres import MeshSphere, wrong_unit
 from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
 from service.core.errors import ComputeError

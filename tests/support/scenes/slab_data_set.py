@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.pixels.rays import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.compute.pixels.views import splits
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.records import DataSet, Mesh, PosedView

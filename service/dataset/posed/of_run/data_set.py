@@ -13,7 +13,7 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import WorldSphere, hull_mask
-from service.compute.pixels.rays import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.compute.pixels.views import splits
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse
