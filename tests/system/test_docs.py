@@ -171,12 +171,12 @@ RUN_ELSEWHERE = {
     ),
     **dict.fromkeys(
         ("make test-drawn", "make test-realtime", "make test-whole", "make test-sweeps"),
-        "tests/house/test_suite_rules.py::"
+        "tests/code_rules/test_suite_rules.py::"
         "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
     ),
     **dict.fromkeys(
         ("make marks", "make marks FILES=tests/core"),
-        "tests/house/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
+        "tests/code_rules/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
     ),
     "python -m tests.support.record.new_schema": (
         "tests/store/test_store_chain.py::test_a_new_database_is_what_the_migrations_make"
@@ -214,7 +214,7 @@ RUN_ELSEWHERE = {
         "tests/imports/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
     ),
     "orthocapture simulate rig --scene 7 --dir rig --second-camera stereo": (
-        "tests/further/test_second_camera_whole_run.py::test_the_extrinsics_are_true_within_their_covariance"
+        "tests/second_camera/test_second_camera_whole_run.py::test_the_extrinsics_are_true_within_their_covariance"
     ),
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/handheld/test_handheld.py::test_the_evidence_verifies"
@@ -289,10 +289,10 @@ RUN_ELSEWHERE = {
             "orthocapture simulate rig --scene 7 --dir rig --scanner zivid",
             "orthocapture simulate rig --ct-sends-to 127.0.0.1:11112 --scene 7 --dir rig",
         ),
-        "tests/further/test_second_camera_whole_run.py::test_the_series_was_sent_and_the_scan_is_of_its_profile",
+        "tests/second_camera/test_second_camera_whole_run.py::test_the_series_was_sent_and_the_scan_is_of_its_profile",
     ),
     'orthocapture simulate rig --scene 7 --dir rig --camera "Canon EOS R5"': (
-        "tests/further/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
+        "tests/second_camera/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     "orthocapture simulate ct --scene 7 --folder ct --once --products": (
         "tests/scanner/test_scan_ct_simulators.py::test_the_products_of_one_acquisition_are_delivered_together"

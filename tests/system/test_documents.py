@@ -86,7 +86,10 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("mutants SEED=1", ".venv/bin/python -m bench.suite.mutants --seed 1 --count 300 --at-least 0"),
         ("demo", ".venv/bin/orthocapture demo"),
         ("lint", ".venv/bin/python -m bench.suite.marks --check"),
-        ("lock", "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt"),
+        (
+            "lock",
+            "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' .ci/constraints-dev.txt",
+        ),
         ("docs", ".venv/bin/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs"),
         ("reference", ".venv/bin/python -m docs.generate"),
         ("test-versions", ".ci/versions"),

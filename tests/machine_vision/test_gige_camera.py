@@ -149,7 +149,7 @@ def test_half_of_the_packets_are_asked_for_again(way: dict[str, str], tmp_path: 
 
 
 def test_a_camera_that_dies_and_one_that_comes_back(producer: Path, tmp_path: Path) -> None:
-    """With harvesters; with Aravis, tests/industrial/test_genicam_driver.py does so."""
+    """With harvesters; with Aravis, tests/machine_vision/test_genicam_driver.py does so."""
     with ExitStack() as until_the_end:
         with industrial_camera(FAULTY):
             way = {"producer": str(producer)}
