@@ -62,6 +62,15 @@ def test_links_of_the_documents_lead_somewhere() -> None:
             assert "://" in target or (document.parent / target).exists(), f"{document.name}: {target}"
 
 
+def test_every_picture_beside_the_documents_is_shown_by_one() -> None:
+    """`python -m bench.pages.screens` takes all others whenever somebody wants to look at them."""
+    texts = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+    pictures = [path for part in ("screens", "images") for path in (ROOT / "docs" / part).iterdir()]
+    assert [
+        path.name for path in pictures if path.suffix != ".md" and f"{path.parent.name}/{path.name})" not in texts
+    ] == []
+
+
 def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
     """For errors of the simulated arm's own model, and for an arm with other errors (bench/calibration/hand_eye)."""
     measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-27.json").read_text())
