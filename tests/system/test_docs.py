@@ -64,13 +64,13 @@ def site(tmp_path: Path, recorded: tuple[Path, str]) -> Site:
 
 
 RUN_HERE: dict[str, Check] = {
-    "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
-    "orthocapture protocol check protocols/dry_run.yaml": succeeds,
+    "orthocapture protocol check exvivo_spine": succeeds,
+    "orthocapture protocol check dry_run": succeeds,
     "orthocapture doctor --rig rig.yaml": succeeds,
     "orthocapture doctor --rig rig.yaml --record devices.json": succeeds,
-    "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
+    "orthocapture run exvivo_spine --rig rig.yaml --data runs "
     '--operator "A. Name" --specimen "Spine 7"': starts_and_is_aborted,
-    'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
+    'orthocapture run dry_run --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
     "orthocapture resume latest --data runs": asks_and_is_aborted,
     "orthocapture status latest --data runs": succeeds,
     "orthocapture plan next latest --data runs": succeeds,
@@ -116,10 +116,10 @@ RUN_ELSEWHERE = {
     "--board 16x23 --square-mm 15 --out hand_eye.json": (
         "tests/calibration/test_hand_eye_arm.py::test_the_command_calibrates_photographs"
     ),
-    "orthocapture plan show protocols/exvivo_spine.yaml --rig rig.yaml": (
+    "orthocapture plan show exvivo_spine --rig rig.yaml": (
         "tests/steps/test_planning.py::test_the_command_plans_from_files_alone"
     ),
-    "orthocapture plan show protocols/dry_run.yaml --rig rig.yaml": (
+    "orthocapture plan show dry_run --rig rig.yaml": (
         "tests/rig/test_dry_run.py::test_every_viewpoint_is_planned_from_the_documented_rig_file"
     ),
     "orthocapture spheres --mesh scan.ply --radius-mm 15 --out spheres.json": (
@@ -238,7 +238,7 @@ RUN_ELSEWHERE = {
     'orthocapture audit rotate-key --lost --reason "disk died" --data restored': (
         "tests/store/test_backup.py::test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed"
     ),
-    "orthocapture doctor --rig rig.yaml --protocol protocols/exvivo_spine.yaml --data runs": (
+    "orthocapture doctor --rig rig.yaml --protocol exvivo_spine --data runs": (
         "tests/rig/test_space.py::test_doctor_and_pages_say_it_before_a_run"
     ),
     "orthocapture audit verify --signatures FILE": (
