@@ -134,7 +134,7 @@ def test_the_help_groups_every_command_by_what_it_is_for() -> None:
 
 
 def test_the_shell_completes_commands() -> None:
-    assert _completed("orthocapture re", 1) == ["resume", "register", "replay"]
+    assert _completed("orthocapture re", 1) == ["resume", "replay", "register"]
     assert _completed("orthocapture calibrate ", 2) == ["intrinsics", "hand-eye"]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -163,6 +164,10 @@ RUN_ELSEWHERE = {
     ),
     "python -m bench.markers.detectors": (
         "tests/markers/test_grounded.py::test_all_detectors_are_measured_side_by_side"
+    ),
+    **dict.fromkeys(
+        (". .venv/bin/activate", "orthocapture --help"),
+        "tests/system/test_docs.py::test_the_environment_is_activated_and_the_command_is_there",
     ),
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
@@ -342,6 +347,18 @@ def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
     file, name = test.split("::")
     module = ast.parse((ROOT / file).read_text(encoding="utf-8"))
     assert name in {node.name for node in module.body if isinstance(node, ast.FunctionDef)}, command
+
+
+def test_the_environment_is_activated_and_the_command_is_there(tmp_path: Path) -> None:
+    """As the README has it; `.venv` is where the Makefile puts what these tests run in."""
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    words = ". .venv/bin/activate && command -v orthocapture && orthocapture --help"
+    shell = subprocess.run(
+        ["/bin/sh", "-c", words], cwd=tmp_path, env={**os.environ, "PATH": "/usr/bin:/bin", "COLUMNS": "80"},
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert shell.returncode == 0, shell.stderr
+    assert "╭─ Capture" in shell.stdout
 
 
 def test_commands_are_found_in_blocks_tables_and_text() -> None:
