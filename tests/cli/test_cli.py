@@ -141,7 +141,7 @@ def test_status_shows_steps_gates_and_views(recorded: tuple[Path, str, str], mon
     monkeypatch.setattr(console, "width", 220)  # a narrower table breaks its lines
     result = invoke("status", completed, "--data", data)
     assert result.exit_code == 0
-    assert "viewpoints_captured 4, allowed ≥ 3: ok" in result.output
+    assert "Viewpoints captured 4, allowed ≥ 3: ok" in result.output
     record = answer_of(invoke("status", completed, "--data", data, "--json"))
     assert (record["run"], record["status"]) == (completed, "completed")
     assert record["steps"]["capture"]["captured"] == ["v001", "v002", "v003", "v004"]
