@@ -135,13 +135,13 @@ $(READY): pyproject.toml .ci/constraints.txt
 		"orthocapture runs on Python 3.11 to 3.13, not on %d.%d: make clean, then make" % sys.version_info[:2])'
 	$(PIP) --no-compile --only-binary :all: --require-hashes -r .ci/constraints.txt
 	$(PIP) --no-deps --no-build-isolation --editable .
-	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/torch/testing/' .venv/lib service drivers simulators
+	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/tests/|/torch/testing/' .venv/lib service drivers simulators
 	touch $(READY)
 
 # jsonpath-rw, which mlcroissant needs, is published as a source archive alone: plain Python, built with our setuptools.
 $(TOOLS): $(READY) .ci/constraints-dev.txt
 	$(PIP) --no-compile --only-binary :all: --no-binary jsonpath-rw --no-build-isolation --require-hashes -r .ci/constraints-dev.txt
-	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/torch/testing/' .venv/lib
+	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/tests/|/torch/testing/' .venv/lib
 	touch $(TOOLS)
 
 # The packages of the detector `grounded`, for its tests: PyTorch without CUDA where the index has that build. Its hash

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 from collections.abc import Generator
@@ -21,10 +20,10 @@ from tests.recovery.test_resume import captured, recorded, short_protocol, wait_
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.timeout(500)]
+pytestmark = [pytest.mark.timeout(800)]
 HOST = "127.0.0.32"
 MEMORY_BYTES = 600_000_000  # of data, for each process
-# Low priority on one processor, which others want as well, and little memory; its drivers inherit all of it.
+# Low priority on one processor, which another wants as well, and little memory; its drivers inherit all of it.
 PRESSED = (
     "import os, resource, sys\n"
     "os.nice(5)\n"
@@ -50,12 +49,11 @@ def begun(words: list[str], log: Path, *before: str) -> Generator[subprocess.Pop
 
 
 @contextmanager
-def pressed(words: list[str], log: Path, rivals: int = 2) -> Generator[subprocess.Popen[bytes]]:
+def pressed(words: list[str], log: Path) -> Generator[subprocess.Popen[bytes]]:
     """The command on a machine that has little for it."""
     with ExitStack() as stack:
-        for _ in range(rivals):
-            rival = stack.enter_context(subprocess.Popen([sys.executable, "-c", RIVAL]))
-            stack.callback(rival.kill)
+        rival = stack.enter_context(subprocess.Popen([sys.executable, "-c", RIVAL]))
+        stack.callback(rival.kill)
         yield stack.enter_context(begun(words, log, "-c", PRESSED))
 
 
@@ -65,26 +63,23 @@ def drivers_of(runner: subprocess.Popen[bytes]) -> list[psutil.Process]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGALRM], ids=lambda number: number.name)
-def test_a_killed_driver_ends_no_run_and_it_is_resumed_on_a_pressed_machine(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_killed_driver_ends_no_run_and_it_is_resumed_on_a_pressed_machine(tmp_path: Path) -> None:
+    """Other signals are told in the same way: tests/robot/test_host.py."""
     data, log = tmp_path / "data", tmp_path / "run.log"
     with simulated_rig(tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "3", host=HOST) as ready:
         words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data)]
         with begun([*words, "--auto-confirm", "--no-worker", "--json"], log) as runner:
             wait_for_captures(data, 2, runner, log)
-            drivers_of(runner)[-1].send_signal(number)
-            assert runner.wait(timeout=120) == WAITS_FOR_A_PERSON, log.read_text()
+            drivers_of(runner)[-1].kill()
+            assert runner.wait(timeout=300) == WAITS_FOR_A_PERSON, log.read_text()
         before = captured(data)
         assert 2 <= len(before) < 6
-        assert number.name in recorded(data, StepFailed)[-1].message
-        assert any(number.name in trouble.message for trouble in recorded(data, DeviceTrouble))
+        assert "SIGKILL" in recorded(data, StepFailed)[-1].message
+        assert any("SIGKILL" in trouble.message for trouble in recorded(data, DeviceTrouble))
         asked = json.loads(next(line for line in log.read_text().splitlines() if line.startswith('{"error"')))
         assert asked["exit_status"] == WAITS_FOR_A_PERSON
-        assert number.name in asked["error"]["what"]
-        if number == signal.SIGKILL:  # how the driver ended is told now, and what follows is the same
-            must_be_resumed(data, before, log)
+        assert "SIGKILL" in asked["error"]["what"]
+        must_be_resumed(data, before, log)
 
 
 def must_be_resumed(data: Path, before: list[dict[str, Any]], log: Path) -> None:

@@ -110,7 +110,9 @@ def test_a_covered_board_a_blurred_and_a_black_image_are_taken_again_at_once(tmp
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 def test_a_smeared_lens_is_cleaned_and_exactly_the_blurred_images_are_taken_again(tmp_path: Path) -> None:
+    """Without a wire, it is in tests/steps/test_board_capture.py."""
     smeared_at = 7
     ran = run(
         tmp_path, ({"kind": "smear", "nth": smeared_at},), "camera_set_up", "camera_calibration", host="127.0.0.43"

@@ -254,13 +254,16 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[schemathesis.Case[An
     return drawn
 
 
+ALWAYS: tuple[Role, ...] = ("administrator", "technician")  # those who may change most of a site and of a run
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "role",
     [
         None,
-        "administrator",
-        *(pytest.param(role, marks=pytest.mark.slow) for role in ROLES if role != "administrator"),
+        *ALWAYS,
+        *(pytest.param(role, marks=pytest.mark.sweep) for role in ROLES if role not in ALWAYS),
     ],
 )
 def test_generated_requests_never_break_the_server(

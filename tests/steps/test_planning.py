@@ -201,6 +201,7 @@ def test_a_viewpoint_through_the_table_is_refused_and_says_so(scene: PlanningSce
     assert "table" in plan.refused[0].reason or "specimen" in plan.refused[0].reason
 
 
+@pytest.mark.slow
 def test_an_arm_that_stands_in_an_obstacle_is_told_so_instead_of_a_blocked_way(scene: PlanningScene) -> None:
     at_flange = forward(ARM, scene.start_rad[None])[0][:3, 3]
     stand = Capsule(at_flange, at_flange + np.array([0.0, 0.0, 0.05]), 0.05)
