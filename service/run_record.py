@@ -253,6 +253,10 @@ class StepEvidence:
         """What people at screens have asked of this step, in order."""
         return self.log.refresh().steps[self.step].asked
 
+    def computing(self) -> bool:
+        """Whether a worker computes a job of this run at this moment."""
+        return bool(self.log.store.jobs_started(self.log.run_id))
+
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
         """The jobs of a step, in the order in which they were enqueued."""
         jobs = self.log.refresh().steps[step_id].jobs.values()

@@ -257,6 +257,10 @@ class Evidence(Protocol):
         """What people have asked of this step on the pages so far, in order."""
         ...
 
+    def computing(self) -> bool:
+        """Whether a worker computes a job of this run at this moment."""
+        ...
+
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
         """The jobs of a step in their present state, in the order in which they were enqueued."""
         ...

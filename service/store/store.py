@@ -328,7 +328,7 @@ class Store:
     def jobs_started(self, run_id: str) -> dict[str, str]:
         """Start time (UTC) of each job of a run that is being computed, by the job's name."""
         with self._database.reading() as connection:
-            return queue.started(connection, run_id)
+            return queue.started(connection, self.clock, run_id)
 
     def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
         """Number of jobs of a run, or of all runs, that are queued or being computed.

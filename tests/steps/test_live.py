@@ -355,6 +355,28 @@ def test_a_machine_that_is_slow_is_waited_for_while_it_goes_on_and_every_image_i
 
 
 @pytest.mark.slow
+def test_a_job_that_takes_long_is_waited_for_while_a_worker_computes_it(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5, gates=UNEXAMINED)
+    compute, until_s = bench.operator.on_show, [0.0]
+
+    def the_last_image_takes_long(what: str) -> None:
+        if len(bench.captured()) == 5 and not until_s[0]:
+            job = bench.store.claim_job("slow", 3 * WAIT_S, kinds=["live_view"])
+            until_s[0] = bench.clock.monotonic_s() + 3 * WAIT_S if job is not None else 0.0
+        if bench.clock.monotonic_s() >= until_s[0]:
+            compute(what)
+
+    bench.operator.on_show = the_last_image_takes_long
+    state = bench.run()
+    assert until_s[0]
+    assert state.status == "completed"
+    assert state.steps["capture"].measures["images_unexamined"] == 0
+    assert "live_numbers_late" not in [note.note for note in bench.payloads(StepNote)]
+
+
+@pytest.mark.slow
 def test_images_that_nobody_looked_at_are_counted_and_judged_when_the_worker_is_back(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

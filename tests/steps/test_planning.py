@@ -8,8 +8,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +38,7 @@ from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.plan.planning import ArmAtStation, posture_without_plan, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.steps.capture.plan.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
@@ -132,20 +130,6 @@ def test_shoulder_elbow_and_wrist_keep_their_sides_though_the_camera_must_turn_f
     assert found[5] - BEFORE_RAD[5] > 3.0
 
 
-@pytest.mark.parametrize(("model", "planned"), [("UR10e", True), ("an arm that nobody knows", False)])
-def test_a_pose_without_a_plan_is_solved_near_the_posture_that_a_plan_would_take(model: str, planned: bool) -> None:
-    """Before, near where the arm stood, so that the controller chose the side of the wrist."""
-    robot: Any = SimpleNamespace(
-        state=lambda: SimpleNamespace(sample=SimpleNamespace(joints_rad=BEFORE_RAD)),
-        report=lambda: SimpleNamespace(identity=SimpleNamespace(model=model)),
-    )
-    context: Any = SimpleNamespace(devices=SimpleNamespace(surroundings=lambda: (CollisionSection(), None)))
-    T = forward(ARM, TURNED_OVER_RAD[None])[0]
-    near = nearest_posture(ARM, T, BEFORE_RAD)
-    assert near is not None
-    assert np.array_equal(posture_without_plan(context, robot, T), near if planned else BEFORE_RAD)
-
-
 def test_the_nearest_posture_turns_no_joint_by_a_needless_revolution() -> None:
     q = np.array([4.5, -1.7, 1.4, -1.4, -1.5, -6.0])
     T = forward(ARM, q[None])[0]
@@ -211,6 +195,16 @@ def test_a_viewpoint_through_the_table_is_refused_and_says_so(scene: PlanningSce
     plan = planned(scene, camera_at((0.35, -0.3, -0.02)), camera_at((0.0, 0.0, 0.62)))
     assert [v.outcome for v in plan.views] == ["feasible", "refused"]
     assert "table" in plan.refused[0].reason or "specimen" in plan.refused[0].reason
+
+
+def test_an_arm_that_stands_in_an_obstacle_is_told_so_instead_of_a_blocked_way(scene: PlanningScene) -> None:
+    at_flange = forward(ARM, scene.start_rad[None])[0][:3, 3]
+    stand = Capsule(at_flange, at_flange + np.array([0.0, 0.0, 0.05]), 0.05)
+    inside = replace(scene, obstacles=replace(scene.obstacles, others=(("lamp", stand),)))
+    for view in planned(inside, camera_at((0.2, -0.2, 0.6)), camera_at((-0.2, -0.2, 0.6))).views:
+        assert view.outcome == "refused"
+        assert view.reason.startswith("where the arm stands, the ")
+        assert view.reason.endswith("would touch the lamp: move it clear by its pendant")
 
 
 def test_a_viewpoint_in_the_specimen_is_refused_and_says_so(scene: PlanningScene) -> None:

@@ -61,6 +61,7 @@ class PlannedView:
     nudge_deg: float = 0.0  # about the vertical through the scene's centre
     joints_rad: Array = field(default_factory=lambda: np.full(0, np.nan), repr=False)  # (N,); empty if refused
     travel_s: float = 0.0  # from the previous view
+    from_rad: Array | None = None  # (N,) joints at which its way begins: those of the previous view, or of the start
     # (M, N) the joints of a detour, from those of the previous view on, to the last before this view's; straight from
     # each to the next. Empty if the way is straight.
     way_rad: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
@@ -128,11 +129,13 @@ def plan_motion(
             vain += 0 if len(round_about.way_rad) else _ROUND_POSTURES
             able[i], blocked = round_about, "" if len(round_about.way_rad) else blocked
         if blocked:
-            refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
+            stands = scene.freedom.obstruction(here[None])
+            reason = f"where the arm stands, {stands}: move it clear by its pendant" if stands else ""
+            refused.append(replace(able[i], outcome="refused", reason=reason or f"on the way there {blocked}"))
             continue
         legs = [*able[i].way_rad, able[i].joints_rad] if len(able[i].way_rad) else [here, able[i].joints_rad]
         travel_s = float(_legs_s(np.stack(legs), scene).sum())
-        kept.append(replace(able[i], travel_s=travel_s))
+        kept.append(replace(able[i], travel_s=travel_s, from_rad=here))
         total += travel_s + scene.pause_s
         here = able[i].joints_rad
     listed_s = float(_legs_s(way, scene).sum())

@@ -11,7 +11,7 @@ from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.design import CalibrationTargets, ChosenViews, PlanPrediction
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
-from service.compute.planning.motion_plan import best_posture
+from service.compute.planning.motion_plan import Order, best_posture
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.text.counts import counted
@@ -27,7 +27,7 @@ from service.steps.board.plan import (
     prediction_record,
 )
 from service.steps.board.poses import BoardPoses
-from service.steps.capture.plan.planning import arm_at_station, plan_step, usual_posture
+from service.steps.capture.plan.planning import StepPlan, arm_at_station, plan_step, usual_posture
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.retakes import taken_for_good, to_take_again
 from service.steps.capture.views import CaptureTask, capture_viewpoints
@@ -280,22 +280,21 @@ class BoardCapture:
         again = to_take_again(self.context)
         done = taken_for_good(self.context.evidence.captures(self.context.step.id), again)
         todo = [v for v in poses if v.name not in done]
-        refused: Mapping[str, str] = {}
-        stands_rad: dict[str, Array] = {}
-        if todo:
-            board = self._knowledge(self.looks(wait=False)).T_base_board
-            order = "as_listed" if self.given else "shortest"
-            planned = plan_step(self.context, todo, self._mount, order, sharp_at_m=apply(board, self.board.points()))
-            todo, refused, stands_rad = list(planned.viewpoints), planned.refused, dict(planned.starts_rad)
+
+        def plan(viewpoints: Sequence[Viewpoint], order: Order = "as_listed") -> StepPlan:
+            known = self._knowledge(self.looks(wait=False)) if viewpoints else None
+            sharp_at_m = None if known is None else apply(known.T_base_board, self.board.points())
+            return plan_step(self.context, viewpoints, self._mount, order, sharp_at_m=sharp_at_m)
+
         task = CaptureTask(
-            [*todo, *(v for v in poses if v.name in done)],
+            plan(todo, "as_listed" if self.given else "shortest"),
+            [v for v in poses if v.name in done],
+            plan,
             self._mount,
             image_kind="board_image",
-            refused=refused,
             on_captured=self._looks.begin,
             stop=lambda: bool(self._looks.spoilt_in_a_row()),
             again=again,
-            stands_rad=stands_rad,
         )
         capture_viewpoints(self.context, task)
 

@@ -271,7 +271,7 @@ class LiveAnalysis:
             left = sum(job.status == "enqueued" for job in waiting)
             if not left:
                 return
-            if left != before:
+            if left != before or self.context.evidence.computing():
                 before, since_s = left, self.context.monotonic_s()
             if self.context.monotonic_s() - since_s > self.params.wait_s:
                 self.context.note("live_numbers_late", images=left)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,7 +36,7 @@ from service.steps.capture.exposure import (
 )
 from service.steps.capture.further_cameras.images import exposing_at, settings_of
 from service.steps.capture.motion import MotionLimits, move_and_settle, require_there, settle_criteria
-from service.steps.capture.plan.planning import posture_without_plan
+from service.steps.capture.plan.planning import StepPlan
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.capture.retakes import taken_for_good
 from service.steps.context import FurtherCamera, StepContext
@@ -50,7 +50,7 @@ WORTH_ANOTHER_TRY = (
     UnreadableFileError,
 )
 
-# How far the arm may stand from where a detour was planned to begin: its controller solves for joints by its own
+# How far the arm may stand from where a way was planned to begin: its controller solves for joints by its own
 # calibration.
 _BEGINS_RAD = 0.03
 
@@ -81,28 +81,34 @@ class CaptureTask:
     """What a capture loop is to do.
 
     Attributes:
-        viewpoints: to capture, in order; those that this attempt has captured already are skipped.
+        plan: of the motions: the viewpoints to capture, in order, and those that it leaves out, which are recorded as
+            given up.
+        taken: further viewpoints of the step, which have their image; a person may ask for another while it runs.
+        plan_anew: plans the motions to these viewpoints, in this order, from where the arms stand. Called if an arm
+            stands elsewhere than where its way was planned to begin, as after a viewpoint that could not be taken.
         T_flange_camera: (4, 4) the best known mounting. It decides where the camera goes; what is recorded is the
             measured pose of the flange.
         image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
-        refused: viewpoints that the plan left out, with the reason; they are recorded as given up.
         on_captured: called after each image is recorded; must return at once.
         stop: called before each viewpoint; if it returns True, the rest is not captured.
         again: SHA-256 of images to take again.
         all_cameras: whether the rig's further cameras expose as well.
-        stands_rad: joints (N,) where the arm of each station must stand when it is moved next: from where its motions
-            were planned, then where it was sent last. The capture keeps it up to date.
     """
 
-    viewpoints: Sequence[Viewpoint]
+    plan: StepPlan
+    taken: Sequence[Viewpoint]
+    plan_anew: Callable[[Sequence[Viewpoint]], StepPlan]
     T_flange_camera: Transform
     image_kind: str
-    refused: Mapping[str, str] = field(default_factory=dict[str, str])
     on_captured: Callable[[], None] = lambda: None
     stop: Callable[[], bool] = lambda: False
     again: Collection[str] = ()
     all_cameras: bool = False
-    stands_rad: dict[str, Array] = field(default_factory=dict[str, Array])
+
+    @property
+    def names(self) -> list[str]:
+        """Of all viewpoints of the step."""
+        return [viewpoint.name for viewpoint in (*self.plan.viewpoints, *self.taken)]
 
 
 def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals:
@@ -122,10 +128,10 @@ def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals
     finally:
         loop.keep()  # however the loop ends, an image that has arrived is recorded
         at(viewpoint="")
-    context.progress("viewpoints", len(task.viewpoints), len(task.viewpoints))
+    context.progress("viewpoints", len(task.names), len(task.names))
     captures = context.evidence.captures(context.step.id)
     return CaptureTotals(
-        planned=len(task.viewpoints),
+        planned=len(task.names),
         captured=len(captures),
         given_up=len(loop.given_up),
         settings_departures=sum(not capture.verdicts["settings"] for capture in captures),
@@ -151,26 +157,28 @@ class _CaptureLoop:
     _held: Shot | None = field(init=False, default=None)
     _size: str = field(init=False, default="")  # of an image, in words, once there is one
     _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (N,) solved ahead
+    # By station, joints (N,) where the arm must stand when it is moved next: from where its motions were planned, and
+    # then where it was sent last.
+    _stands_rad: dict[str, Array] = field(init=False, default_factory=dict[str, Array])
+    _planned: dict[str, Viewpoint] = field(init=False, default_factory=dict[str, Viewpoint])  # in order
+    _refused: dict[str, str] = field(init=False, default_factory=dict[str, str])  # why the plan leaves them out
 
     def __post_init__(self) -> None:
         self.given_up = set(self.context.state.skipped_viewpoints)
+        self._follow(self.task.plan)
 
     def run(self) -> None:
         """Capture what is missing. `keep` must be called afterwards, as the last image may still be held."""
-        refused = self.task.refused
         # Determined anew each time, because an operator may have a viewpoint repeated while the arm moves.
         while todo := self._next():
             self.context.checkpoint()
             if self.task.stop():
                 return
             self.context.evidence.require_space()
-            self.context.progress("viewpoints", len(self.task.viewpoints) - len(todo), len(self.task.viewpoints))
+            self.context.progress("viewpoints", len(self.task.names) - len(todo), len(self.task.names))
             viewpoint = todo[0]
-            if viewpoint.name in refused:
-                self._give_up(viewpoint, _left_out(viewpoint, refused[viewpoint.name]))
-                continue
             try:
-                shot = self._capture_with_retries(viewpoint, todo[1:])
+                shot = self._capture_with_retries(todo)
             except UnreachablePoseError as error:
                 self._give_up(viewpoint, error)
             else:
@@ -197,7 +205,8 @@ class _CaptureLoop:
         done = taken_for_good(captures, self.task.again) | (self._tried & {one.viewpoint for one in captures})
         if self._held is not None:
             done.add(self._held.viewpoint.name)
-        left = [v for v in self.task.viewpoints if v.name not in done and v.name not in self.given_up]
+        every = [*self._planned.values(), *(v for v in self.task.taken if v.name not in self._planned)]
+        left = [v for v in every if v.name not in done and v.name not in self.given_up]
         if left or self._held is None:
             return left
         self.keep()
@@ -208,17 +217,30 @@ class _CaptureLoop:
         self._record_failure(viewpoint, error, skipped=True)
         self.given_up.add(viewpoint.name)
 
-    def _capture_with_retries(self, viewpoint: Viewpoint, later: Sequence[Viewpoint]) -> Shot:
-        context = self.context
+    def _follow(self, plan: StepPlan) -> None:
+        """Take over the ways of a plan; what was planned before and is not in it comes last."""
+        fresh = {viewpoint.name: viewpoint for viewpoint in plan.viewpoints}
+        self._planned = fresh | {name: v for name, v in self._planned.items() if name not in fresh}
+        self._refused = {name: why for name, why in self._refused.items() if name not in fresh} | dict(plan.refused)
+        self._stands_rad |= plan.starts_rad
+        self._targets.clear()
+
+    def _capture_with_retries(self, todo: Sequence[Viewpoint]) -> Shot:
+        """Capture the first of the viewpoints still to capture."""
+        context, viewpoint = self.context, todo[0]
         at(viewpoint=viewpoint.name)
+        if viewpoint.name in self._refused:
+            raise self._left_out(viewpoint)
         robot = context.devices.robot(viewpoint.station)
         was_busy = False
         for tries_left in range(context.step.recovery.retries, -1, -1):
             arrived = False
             try:
+                todo = self._planned_from_here(robot, todo)
+                viewpoint = todo[0]
                 settled = self._go_to(robot, viewpoint)
                 arrived = True
-                environment = self._dwell(robot, later)
+                environment = self._dwell(robot, todo[1:])
                 context.busy(f"taking {viewpoint.name} and fetching it from the camera{self._size}")
                 further = exposing_at(context, viewpoint, self.further)
                 exposure = Exposure(
@@ -257,12 +279,38 @@ class _CaptureLoop:
             self.context.busy("setting the camera")
             camera.apply(wanted)
 
+    def _planned_from_here(self, robot: RobotArm, todo: Sequence[Viewpoint]) -> Sequence[Viewpoint]:
+        """The viewpoints still to capture, the way to the first of which was planned from where the arm stands.
+
+        All are planned anew if it was not: after a viewpoint that could not be taken, or if one is taken again.
+
+        Raises:
+            UnreachablePoseError: from here the arm cannot take the first of them.
+        """
+        first = todo[0]
+        here_rad = robot.state().sample.joints_rad
+        sent_rad = self._stands_rad.get(first.station)
+        if sent_rad is not None:
+            self._require_there(robot, self.context.devices.layout(first.station).robot, here_rad, sent_rad)
+        unchecked = first.from_rad is None  # the arm's kinematics are not known
+        if first.name in self._planned and (unchecked or _begins(first, here_rad) or _ends(first, here_rad)):
+            return todo
+        plan = self.task.plan_anew(todo)
+        self._follow(plan)
+        if first.name in plan.refused:
+            raise self._left_out(first)
+        return plan.viewpoints
+
+    def _left_out(self, viewpoint: Viewpoint) -> UnreachablePoseError:
+        return UnreachablePoseError(
+            f"the plan leaves it out: {self._refused[viewpoint.name]}",
+            where=viewpoint.name,
+            remedy="Remove the obstacle, or choose another viewpoint",
+        )
+
     def _go_to(self, robot: RobotArm, viewpoint: Viewpoint) -> SettleReport:
         context = self.context
         name = context.devices.layout(viewpoint.station).robot
-        sent_rad = self.task.stands_rad.pop(viewpoint.station, None)  # a motion that is cut short ends anywhere
-        if sent_rad is not None:
-            self._require_there(robot, name, robot.state().sample.joints_rad, sent_rad)
         target = self._targets.pop(viewpoint.name, None)
         if target is None:
             target = self._solve(robot, viewpoint)
@@ -275,28 +323,13 @@ class _CaptureLoop:
             self._require_there(robot, name, settled.joints_rad, joints_rad)
             return settled
 
-        for joints_rad in self._detour(robot, viewpoint):
-            move(joints_rad)
+        self._stands_rad.pop(viewpoint.station, None)  # a motion that is cut short ends anywhere
+        if not _ends(viewpoint, robot.state().sample.joints_rad):
+            for joints_rad in viewpoint.way_rad[1:]:
+                move(joints_rad)
         settled = move(target)
-        self.task.stands_rad[viewpoint.station] = target
+        self._stands_rad[viewpoint.station] = target
         return settled
-
-    def _detour(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
-        """The joints (M, N) to go through on the way to a viewpoint whose straight way is blocked; none for others.
-
-        Raises UnreachablePoseError if the arm does not stand where the detour begins, as after a viewpoint before it
-        that could not be taken.
-        """
-        if not len(viewpoint.way_rad):
-            return viewpoint.way_rad
-        away_rad = np.abs(robot.state().sample.joints_rad - viewpoint.way_rad[0])
-        if away_rad.max() > _BEGINS_RAD:
-            raise UnreachablePoseError(
-                "its detour was planned from elsewhere, and the straight way is blocked",
-                where=viewpoint.name,
-                remedy="Confirm to capture what is missing: the motions are planned anew from where the arm stands",
-            )
-        return viewpoint.way_rad[1:]
 
     def _require_there(self, robot: RobotArm, name: str, joints_rad: Array, sent_rad: Array) -> None:
         """Hold the arm until a person has confirmed, if it does not stand where it was sent."""
@@ -319,7 +352,7 @@ class _CaptureLoop:
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
         """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
         target, near = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), viewpoint.joints_rad
-        return robot.solve_ik(target, posture_without_plan(self.context, robot, target) if near is None else near)
+        return robot.solve_ik(target, robot.state().sample.joints_rad if near is None else near)
 
     def _solve_ahead(self, robot: RobotArm, later: Sequence[Viewpoint]) -> None:
         """Solve for the next viewpoint's joints while the arm rests before the exposure, which takes 0.1 s."""
@@ -342,12 +375,14 @@ class _CaptureLoop:
         )
 
 
-def _left_out(viewpoint: Viewpoint, why: str) -> UnreachablePoseError:
-    return UnreachablePoseError(
-        f"the plan leaves it out: {why}",
-        where=viewpoint.name,
-        remedy="Remove the obstacle, or choose another viewpoint",
-    )
+def _begins(viewpoint: Viewpoint, joints_rad: Array) -> bool:
+    """Whether the arm stands where the way to a viewpoint begins."""
+    return viewpoint.from_rad is not None and bool(np.abs(joints_rad - viewpoint.from_rad).max() <= _BEGINS_RAD)
+
+
+def _ends(viewpoint: Viewpoint, joints_rad: Array) -> bool:
+    """Whether the arm stands at a planned viewpoint already."""
+    return viewpoint.joints_rad is not None and bool(np.abs(joints_rad - viewpoint.joints_rad).max() <= _BEGINS_RAD)
 
 
 def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:

@@ -88,9 +88,11 @@ def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> 
     return connection.execute(statement).scalar_one()
 
 
-def started(connection: Connection, run_id: str) -> dict[str, str]:
-    """Start time (UTC) of each job of a run that is being computed, by its name."""
-    running = select(jobs.c.job_id, jobs.c.started_utc).where(jobs.c.run_id == run_id, jobs.c.state == "running")
+def started(connection: Connection, clock: Clock, run_id: str) -> dict[str, str]:
+    """Start time (UTC) of each job of a run that a worker computes and whose lease it renews, by the job's name."""
+    running = select(jobs.c.job_id, jobs.c.started_utc).where(
+        jobs.c.run_id == run_id, jobs.c.state == "running", jobs.c.until_utc_s > clock.utc_s()
+    )
     return {row.job_id: row.started_utc for row in connection.execute(running)}
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivers.interfaces import RobotArm
 from service.compute.arm.inverse_kinematics import nearest_posture
 from service.compute.planning.collision import ArmBody, Capsule, Obstacles
 from service.compute.planning.motion_plan import (
@@ -129,17 +128,6 @@ def arm_at_station(context: StepContext, station: str, T_flange_camera: Transfor
     return ArmAtStation(layout, model, T_flange_camera, collision, optics, context.protocol.motion)
 
 
-def posture_without_plan(context: StepContext, robot: RobotArm, T_base_flange: Transform) -> Array:
-    """Joints (N,) near which a controller solves a pose that nobody planned: those that a plan would take.
-
-    A controller may as well choose a posture with the wrist turned over, from which the next ways are blocked.
-    """
-    here = robot.state().sample.joints_rad
-    model = known_arm(context.devices.surroundings()[0].arm or robot.report().identity.model)
-    found = None if model is None or model.axes != len(here) else nearest_posture(model, T_base_flange, here)
-    return here if found is None else found
-
-
 def _require_slow_enough(context: StepContext, layout: StationLayout, model: ArmModel) -> None:
     """Refuse a motion faster than this arm may move, or than it can stop in time. Raises ConfigurationError."""
     for name, words in motion_problems(context.protocol.motion, [model], layout.abandoned):
@@ -222,7 +210,12 @@ def plan_station(
     stations = {v.name: v.station for v in viewpoints}
     planned = tuple(
         Viewpoint(
-            v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad, v.way_rad
+            v.name,
+            stations[v.name],
+            v.T_base_camera,
+            None if v.outcome == "refused" else v.joints_rad,
+            v.way_rad,
+            v.from_rad,
         )
         for v in answer.views
     )

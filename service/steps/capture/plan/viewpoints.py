@@ -73,6 +73,7 @@ class Viewpoint:
     T_base_camera: Transform
     joints_rad: Array | None = None  # (N,) as planned; None: the solution nearest to the present posture
     way_rad: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (M, N) of a detour, as in PlannedView
+    from_rad: Array | None = None  # (N,) joints from which its way was planned; None: nobody planned one
 
 
 _UP = np.array([0.0, 0.0, 1.0])

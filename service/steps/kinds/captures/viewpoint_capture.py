@@ -11,7 +11,7 @@ from service.core.protocol.step_params import MovingParams, NeededDevice, Repeat
 from service.core.records.events import Record
 from service.steps.capture.live_numbers import LiveAnalysis, LiveParams
 from service.steps.capture.optics import departing_images, optics_departures
-from service.steps.capture.plan.planning import feasible_extra, plan_step
+from service.steps.capture.plan.planning import StepPlan, feasible_extra, plan_step
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.capture.retakes import advise_retakes, taken_for_good, to_take_again
 from service.steps.capture.views import CaptureTask, CaptureTotals, capture_viewpoints
@@ -67,7 +67,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     """Capture every viewpoint set of this step, and the viewpoints that an earlier attempt asked for."""
     again = to_take_again(context)
     capture = _Capture(context, params, again)
-    totals = capture.take(capture.viewpoints, again)
+    totals = capture.take(capture.plan, again)
     measures: dict[str, float] = {}
     spoilt: Mapping[str, str] = {}
     if capture.live is not None:
@@ -111,43 +111,49 @@ class _Capture:
         self._nominal = context.devices.nominal_T_flange_camera()
         done = taken_for_good(context.evidence.captures(context.step.id), again)
         self._features = EarlyFeatures.begin(context, plan)
-        self.viewpoints = [
-            *self._planned([v for v in plan if v.name not in done]),
-            *(v for v in plan if v.name in done),
-        ]
+        self.plan = self._planned([v for v in plan if v.name not in done])
+        self.viewpoints = [*self.plan.viewpoints, *(v for v in plan if v.name in done)]
 
-    def _planned(self, viewpoints: Sequence[Viewpoint]) -> tuple[Viewpoint, ...]:
-        """Plan the motions from where the arms stand; the viewpoints in the planned order."""
-        planned = plan_step(self._context, viewpoints, self._nominal, self._order)
-        self._refused, self._stands_rad = planned.refused, dict(planned.starts_rad)
-        return planned.viewpoints
+    def _planned(self, viewpoints: Sequence[Viewpoint]) -> StepPlan:
+        """Plan the motions from where the arms stand."""
+        return plan_step(self._context, viewpoints, self._nominal, self._order)
 
-    def take(self, viewpoints: Sequence[Viewpoint], again: Collection[str]) -> CaptureTotals:
-        """Capture those viewpoints that have no image, and those whose image (SHA-256) is to be taken again."""
+    def take(self, plan: StepPlan, again: Collection[str]) -> CaptureTotals:
+        """Capture the viewpoints of a plan, and those whose image a person discards meanwhile.
+
+        `again`: images (SHA-256) that are to be taken again.
+        """
+        planned = {viewpoint.name for viewpoint in plan.viewpoints}
         task = CaptureTask(
-            viewpoints,
+            plan,
+            [viewpoint for viewpoint in self.viewpoints if viewpoint.name not in planned],
+            lambda viewpoints: plan_step(self._context, viewpoints, self._nominal, "as_listed"),
             self._nominal,
             image_kind="image" if self._purpose == "dataset" else "control_image",
-            refused=self._refused,
             on_captured=self._look,
             stop=lambda: self.live is not None and bool(self.live.spoilt_in_a_row()),
             again=again,
             all_cameras=self._purpose == "dataset",
-            stands_rad=self._stands_rad,
         )
         return capture_viewpoints(self._context, task)
 
     def repeat_spoilt(self, live: LiveAnalysis, totals: CaptureTotals) -> tuple[CaptureTotals, Mapping[str, str]]:
-        """Take spoilt images again, once; the new totals, and the reason of each image that is spoilt again."""
-        spoilt = live.spoilt()
-        if spoilt:
+        """Take spoilt images again, once each; the new totals, and the reason of each image that is spoilt again.
+
+        An image whose job ends only while others are taken again is taken again after them.
+        """
+        repeated: set[str] = set()
+        while True:
+            spoilt = live.spoilt()
+            due = [viewpoint for viewpoint in self.of_images(spoilt) if viewpoint.name not in repeated]
+            if not due:
+                break
+            repeated |= {viewpoint.name for viewpoint in due}
             for capture in self._context.evidence.captures(self._context.step.id):
                 why = spoilt.get(capture.artefacts[0].sha256)
-                if why is not None:
+                if why is not None and capture.viewpoint in repeated:
                     self._context.tell(f"{capture.viewpoint}: {why}; it is taken again")
-            repeated = self.take(self._planned(self.of_images(spoilt)), spoilt)
-            totals = replace(repeated, planned=totals.planned, given_up=totals.given_up)
-            spoilt = live.spoilt()
+            totals = replace(self.take(self._planned(due), spoilt), given_up=totals.given_up)
         live.note_spoilt(spoilt)
         return totals, spoilt
 
