@@ -354,7 +354,6 @@ def test_a_machine_that_is_slow_is_waited_for_while_it_goes_on_and_every_image_i
     assert "live_numbers_late" not in [note.note for note in bench.payloads(StepNote)]
 
 
-@pytest.mark.slow
 def test_a_job_that_takes_long_is_waited_for_while_a_worker_computes_it(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -7,11 +7,11 @@ import re
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from docs.generate.pages import REFERENCE, pages
 from docs.generate.rooms import layers, pages_with_rooms, rooms_table
 from docs.generate.steps import measures_of_kind
-import pytest
-
 from service.steps import step_kinds
 
 ROOT = Path(__file__).parents[2]
