@@ -48,7 +48,7 @@ class Module:
 
     @property
     def is_init(self) -> bool:
-        """Whether it makes a folder a package."""
+        """Return whether it makes a folder a package."""
         return self.path.name == "__init__.py"
 
     @property
