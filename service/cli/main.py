@@ -241,8 +241,18 @@ def orthocapture(
     _version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", callback=_tell_version, is_eager=True)
     ] = False,
+    allow_mount: Annotated[
+        bool,
+        typer.Option(
+            "--allow-mount", help="Write into a data folder on any file system, also one that other machines mount."
+        ),
+    ] = False,
 ) -> None:
     """Acquire surgical vision data sets that are accurate to a fraction of a millimetre, with proof of origin."""
+    if allow_mount:
+        from service.store.mounts import ALLOW  # noqa: PLC0415 - seldom needed
+
+        os.environ[ALLOW] = "1"  # for the processes, too, that a command starts
 
 
 def main() -> None:
