@@ -62,6 +62,7 @@ lint: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
+	$(BIN)/python -m bench.suite.dialect --check
 	$(BIN)/python -m bench.suite.marks --check
 
 format: $(TOOLS)

@@ -18,13 +18,13 @@ def reading(path: Path, what: str, remedy: str) -> Generator[None]:
 
     Args:
         path: the file that is read.
-        what: as what, such as "a PLY mesh".
-        remedy: what to do about it.
+        what: the thing that is read, such as "a PLY mesh".
+        remedy: the advice for people.
 
     Raises:
-        UnreadableFileError: in place of the library's error.
-        OrthocaptureError: as raised within.
-        OSError: as raised within, if the system cannot open or read the file.
+        UnreadableFileError: it replaces the library's error.
+        OrthocaptureError: one that was raised within.
+        OSError: one that was raised within, if the system cannot open or read the file.
     """
     try:
         yield

@@ -216,7 +216,7 @@ class SerialLightbox:
         heard = b""
         refused: DeviceRefusedError | None = None
         try:
-            port = self._opened()
+            port = self._open_port()
             for _ in range(_ATTEMPTS):
                 # The buffer can hold a banner or the reply to an earlier request.
                 port.reset_input_buffer()
@@ -251,7 +251,7 @@ class SerialLightbox:
             remedy="Check that the box is powered, that the baud rate is right, and that the port is the box's",
         )
 
-    def _opened(self) -> serial.Serial:
+    def _open_port(self) -> serial.Serial:
         if self._port is None:
             try:
                 port = serial.serial_for_url(self._config.port, baudrate=self._config.baudrate, timeout=0.05)
@@ -328,13 +328,13 @@ def without_checksum(line: str) -> str | None:
 
 
 def _checks_lines(firmware: str) -> bool:
-    """Whether boxes of this firmware end their lines with a checksum."""
+    """Return whether boxes of this firmware end their lines with a checksum."""
     numbers = firmware.split(".")
     return len(numbers) == 2 and all(n.isdecimal() for n in numbers) and tuple(map(int, numbers)) >= (1, 4)
 
 
 def _usable(name: str, value: str) -> bool:
-    """Whether a reply's value is valid for the quantity `name`."""
+    """Return whether a reply's value is valid for the quantity `name`."""
     match name:
         case "*IDN":
             return True

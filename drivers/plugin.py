@@ -20,7 +20,7 @@ class DriverConfig(BaseModel):
 
     @property
     def abandoned(self) -> Abandoned | None:
-        """What becomes of a motion whose program died; None for a device that limits its speed by itself."""
+        """Return what becomes of a motion whose program died; None for a device that limits its speed by itself."""
         return None
 
     @property
@@ -43,7 +43,7 @@ class NeedsHeartbeat(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DriverSpec:
-    """What the station needs to know to open a device.
+    """Holds what the station needs to know to open a device.
 
     Attributes:
         kind: robot, camera, scanner, ct or lightbox.
@@ -52,7 +52,7 @@ class DriverSpec:
         hosted: whether the driver must run in a supervised child process (for native libraries).
         call_timeout_s: longest time that one call may take before the child is killed; a config may ask for more.
         reading_timeout_s: the same for calls that only read what the device knows (`report`, `settings`), if shorter.
-        is_arm: of a robot, whether it is an arm. The motions of other axes are not planned; their driver finds them.
+        is_arm: true for a robot that is an arm. The motions of other axes are not planned; their driver finds them.
     """
 
     kind: str

@@ -8,7 +8,7 @@ TOLERANCE = 0.02  # relative: cameras round apertures and exposure times
 
 
 def agrees(value: float, wanted: float) -> bool:
-    """Whether an aperture or an exposure time is the wanted one, up to rounding."""
+    """Return whether an aperture or an exposure time is the wanted one, up to rounding."""
     return abs(value - wanted) <= TOLERANCE * wanted
 
 

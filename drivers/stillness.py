@@ -28,7 +28,7 @@ class PoseSpread:
     rotation_sigma_rad: float
 
     def within(self, criteria: SettleCriteria) -> bool:
-        """Whether both peak-to-peak values are below those of the settle criteria."""
+        """Return whether both peak-to-peak values are below those of the settle criteria."""
         return (
             self.position_peak_to_peak_m < criteria.position_peak_to_peak_m
             and self.rotation_peak_to_peak_rad < criteria.rotation_peak_to_peak_rad

@@ -61,7 +61,7 @@ class VideoConfig(DriverConfig):
 
     @property
     def stated(self) -> CameraSettings:
-        """What the device is set to, as a person states it."""
+        """Return what the device is set to, as a person states it."""
         return CameraSettings(self.aperture_f, self.exposure_s, self.iso)
 
 
@@ -110,7 +110,7 @@ class VideoCamera:
         self.close()
         if self._reader is not None:
             raise self._unavailable("The last connection still waits for an image")
-        source = self._opened()
+        source = self._open_source()
         self._prepare(source)
         self._source, self._newest, self._unused, self._ended = source, None, None, False
         self._files.reopened()
@@ -222,7 +222,7 @@ class VideoCamera:
     def _is_recording(self) -> bool:
         return Path(self._config.port).is_file()
 
-    def _opened(self) -> cv2.VideoCapture:
+    def _open_source(self) -> cv2.VideoCapture:
         path = Path(self._config.port)
         if not path.exists():
             raise self._unavailable("There is no such device or file")

@@ -30,7 +30,7 @@ class Fault(BaseModel):
     )
 
     def due(self, count: int) -> bool:
-        """Whether the count-th (from 1) matching message is to fail."""
+        """Return whether the count-th (from 1) matching message is to fail."""
         return self.nth <= count < self.nth + self.times
 
 

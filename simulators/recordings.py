@@ -52,7 +52,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 
 def not_recorded(args: argparse.Namespace) -> list[str]:
-    """What the body that is replayed did not tell when it was recorded, and what was taken out."""
+    """Return what the body that is replayed did not tell when it was recorded, and what was taken out."""
     if not args.replay:
         return []
     answers = recorded_device(args.replay, "gphoto", args.replayed).answers

@@ -49,7 +49,7 @@ class Terminal:
         self.plug_in()
 
     def receive(self, timeout_s: float) -> bytes:
-        """What arrives within a time; empty if nothing does."""
+        """Return what arrives within a time; empty if nothing does."""
         if self._ends is None or not select.select([self._ends[0]], [], [], timeout_s)[0]:
             return b""
         try:

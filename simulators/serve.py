@@ -29,7 +29,7 @@ def announce(**fields: object) -> None:
     sys.stdout.flush()
 
 
-def told() -> bool:
+def wait_for_line() -> bool:
     """Wait for a line on stdin. Returns False at its end: nobody is there to tell any more."""
     return bool(sys.stdin.readline())
 
@@ -62,7 +62,7 @@ class Termination:
         self._event.set()
 
     def is_set(self) -> bool:
-        """Whether the process should end."""
+        """Return whether the process should end."""
         return self._event.is_set()
 
     def wait(self, timeout_s: float | None = None) -> bool:

@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # begun in the background: what it starts would be deaf as well
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A scene's textures and light are computed once, and kept for the next tests (simulators/rendering/kept.py).
+# A scene's textures and light are computed once, and kept for the next tests (simulators/rendering/array_cache.py).
 os.environ.setdefault("ORTHOCAPTURE_RENDER_CACHE", str(Path(__file__).parents[1] / "build" / "rendered"))
 
 MOST_WORKERS = 12  # each takes up to half a GiB

@@ -87,7 +87,7 @@ class Room:
         return StationLayout(_STATION, "robot", (x, y, z), (-x / away, -y / away, 0.0))
 
     def feasible(self, T_base_camera: Transform) -> bool:
-        """Whether the arm can reach a pose T_base_camera (4, 4)."""
+        """Return whether the arm can reach a pose T_base_camera (4, 4)."""
         return best_posture(T_base_camera, self.planning_scene) is not None
 
     def photograph(self, sent: Transform, shoot: Shoot) -> None:

@@ -82,7 +82,7 @@ WAYS: Mapping[str, Callable[[Path, Path], object]] = {
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What became of one case.
+    """Holds what became of one case.
 
     Attributes:
         file: what was altered.
@@ -164,7 +164,7 @@ def _in_a_process(work: Path, file: str, way: str, moment: str) -> Result:
 
 
 def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
-    """What the writing process notices, and where; "-" for nothing."""
+    """Return what the writing process notices, and where; "-" for nothing."""
     data = work / "data"
     store = Store.open(data)
     (work / "place").mkdir()
@@ -288,7 +288,7 @@ def _afterwards(work: Path, file: str, way: str, moment: str, noticed: str) -> R
 
 
 def _faults(data: Path, copy: Path | None) -> list[str]:
-    """What `audit verify` finds wrong; with the copy in the second place, also what it notes of that."""
+    """Return what `audit verify` finds wrong; with the copy in the second place, also what it notes of that."""
     try:
         report = verify(data, signatures_copy=copy)
         return [str(fault) for fault in report.faults] + [note for note in report.notes if copy and str(copy) in note]

@@ -52,7 +52,7 @@ _SAME = 0.15  # of the radius: largest distance of an outline from its sphere
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What is measured."""
+    """Holds what is measured."""
 
     seed: int
     width: int

@@ -64,7 +64,7 @@ class Case:
 
 @dataclass(slots=True)
 class Outcome:
-    """What the driver did: each call's end, the longest call, and whether it works with a sound controller."""
+    """Holds what the driver did: each call's end, the longest call, and whether it works with a sound controller."""
 
     answer: str
     wrong: str

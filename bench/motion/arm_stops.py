@@ -57,7 +57,7 @@ _LATE_TIMES = 5  # driver, program, their threads and the controller wake one af
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """What the rule says of the grid for one arm: how many combinations it allows, and what it refuses."""
+    """Holds what the rule says of the grid for one arm: how many combinations it allows, and what it refuses."""
 
     arm: str
     allowed: int
@@ -93,7 +93,7 @@ class Stop:
 
     @property
     def verdict(self) -> str:
-        """Whether it stands within the time that is allowed, or would but for the lateness of this machine."""
+        """Return whether it stands within the time that is allowed, or would but for the lateness of this machine."""
         if self.measured_s <= self.rest_within_s:
             return "in time"
         late = self.measured_s > self.rest_within_s + _LATE_TIMES * self.late_s

@@ -21,7 +21,7 @@ _REBOOT_S, _HOUR_S = 600.0, 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens to the host's clocks in the middle of a wait."""
+    """Names what happens to the host's clocks in the middle of a wait."""
 
     name: str
     true_s: float = 0.0  # time that passes meanwhile
@@ -63,7 +63,7 @@ class World:
 
     @property
     def true_utc_s(self) -> float:
-        """What a right clock would show."""
+        """Return what a right clock would show."""
         return self.began_utc_s + self.passed_s
 
     def wake(self, seconds: float) -> None:
@@ -107,7 +107,7 @@ def world(fault: Fault) -> Generator[World]:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the program did after a wait.
+    """Holds what the program did after a wait.
 
     Attributes:
         allows: whether it allowed what it judges by time.
@@ -165,7 +165,7 @@ def above(limit_s: float) -> Callable[[float], bool]:
 
 
 def allows(act: Callable[[], object]) -> bool:
-    """Whether the program allows this."""
+    """Return whether the program allows this."""
     try:
         act()
     except OrthocaptureError:

@@ -92,7 +92,7 @@ class OldPedal:
     armed_s: float | None = None
 
     def confirms(self, count: int, now_s: float) -> bool:
-        """Whether this count would have let the robot move."""
+        """Return whether this count would have let the robot move."""
         if self.armed_s is not None and now_s - self.armed_s > SECOND_PRESS_S[1]:
             self.armed_s = None
         pressed = self.count is not None and count > self.count

@@ -55,7 +55,7 @@ _DONE_S = 0.2  # of the controller's time, in which every act is over
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one act at one moment."""
+    """Holds what became of one act at one moment."""
 
     act: str
     moment: str

@@ -52,7 +52,7 @@ class Outcome:
 
     @property
     def well(self) -> bool:
-        """Whether the run did not mind."""
+        """Return whether the run did not mind."""
         return self.status == "completed" and self.told == 1 and not self.faults
 
 

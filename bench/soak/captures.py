@@ -189,7 +189,7 @@ class _Soak:
                 time.sleep(_LOOK_S)
 
     def _has_too_few_samples(self, ends_s: float) -> bool:
-        """Whether a busy machine has left too few samples to fit lines to, which more time may mend."""
+        """Return whether a busy machine has left too few samples to fit lines to, which more time may mend."""
         return len(warmed_up(self.samples)) < FEWEST and time.monotonic() < ends_s + _LONGEST_S
 
     def _look(self, client: httpx.Client, run: str, state: RunState) -> None:

@@ -23,22 +23,12 @@ from pathlib import PurePosixPath
 from typing import TypeVar
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
+from bench.suite.dialect import PARTICIPLES, PREPOSITIONS, docstrings_of, first_word
 
 ROOMS = ("service", "drivers", "simulators", "bench", "tests")
 SHORT_LINES = 40  # a module below it is hardly a subject of its own
 SHARED_FIELDS = 4  # records that share so many names of fields may mirror each other
 
-#: Words with which a docstring or its first sentence begins that is no sentence with a verb.
-PREPOSITIONS = re.compile(
-    r"about|above|across|after|against|along|among|around|as|at|before|behind|below|beneath|beside|between|beyond|by|"
-    r"down|during|for|from|in|inside|into|like|near|of|off|on|onto|out|outside|over|since|through|to|toward|towards|"
-    r"under|until|up|upon|via|what|where|whether|which|who|whose|with|within|without"
-)
-#: Names of functions that are neither a verb nor the noun that they return.
-PARTICIPLES = re.compile(
-    r"_*(told|added|judged|again|anew|stated|kept|said|shown|found|read_in|asked|given|taken|left|made|seen|done|known|"
-    r"moved|closed|opened|counted|joined|placed|checked|drawn|sorted_out|cut|put|tried|waited|answered|measured)"
-)
 Node = TypeVar("Node", bound=ast.AST)
 
 
@@ -58,7 +48,7 @@ class Module:
 
     @property
     def is_init(self) -> bool:
-        """Whether it makes a folder a package."""
+        """Return whether it makes a folder a package."""
         return self.path.name == "__init__.py"
 
     @property
@@ -93,7 +83,7 @@ def figures_of(room: str, modules: Iterable[Module]) -> dict[str, float]:
     named = Counter(name for m in everything for name in _names(m))
     importers = _importers(everything)
     pairs = sum(len(a & b) >= SHARED_FIELDS for a, b in combinations(dataclasses + models, 2))
-    docstrings = [text for m in own for text in _docstrings(m)]
+    docstrings = [text for m in own for _, text in docstrings_of(ast.walk(m.tree))]
     return {
         "files": len(own),
         "folders": len(folders),
@@ -119,7 +109,7 @@ def figures_of(room: str, modules: Iterable[Module]) -> dict[str, float]:
         ),
         "docstrings": len(docstrings),
         "docstrings that begin with a preposition": sum(
-            PREPOSITIONS.fullmatch(_first_word(text)) is not None for text in docstrings
+            PREPOSITIONS.fullmatch(first_word(text)) is not None for text in docstrings
         ),
         "functions named by a participle or an adverb": sum(
             PARTICIPLES.fullmatch(f.name) is not None for f in functions
@@ -190,20 +180,6 @@ def _records(modules: Iterable[Module]) -> tuple[list[frozenset[str]], list[froz
         elif node.name in models:
             pydantic.append(fields)
     return dataclasses, pydantic
-
-
-def _docstrings(module: Module) -> Iterator[str]:
-    """Yield the docstrings of functions and classes, and each argument's line in them."""
-    for node in _walk(module, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef):
-        text = ast.get_docstring(node)
-        if text:
-            yield text
-            yield from re.findall(r"^    \w+: (.+)$", text, flags=re.MULTILINE)
-
-
-def _first_word(text: str) -> str:
-    found = re.match(r"\W*(\w+)", text)
-    return found.group(1).lower() if found else ""
 
 
 def _table(now: Mapping[str, Mapping[str, float]], before: Mapping[str, Mapping[str, float]]) -> str:

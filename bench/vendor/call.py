@@ -27,39 +27,39 @@ class Call:
 
 
 def true(value: Any) -> bool:
-    """Whether the call returned True."""
+    """Return whether the call returned True."""
     return value is True
 
 
 def done(value: Any) -> bool:
-    """Whether the call returned without a value."""
+    """Return whether the call returned without a value."""
     return value is None
 
 
 def numbers(count: int) -> Callable[[Any], bool]:
-    """Whether the value is a list of `count` finite numbers."""
+    """Return whether the value is a list of `count` finite numbers."""
     return lambda value: len(value) == count and all(math.isfinite(v) for v in value)
 
 
 def number(value: Any) -> bool:
-    """Whether the value is one finite number."""
+    """Return whether the value is one finite number."""
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def within(what: list[float], tolerance: float = 1e-3) -> Callable[[Any], bool]:
-    """Whether the value equals these numbers within the tolerance."""
+    """Return whether the value equals these numbers within the tolerance."""
     return lambda value: (
         len(value) == len(what) and all(abs(a - b) < tolerance for a, b in zip(value, what, strict=True))
     )
 
 
 def zeros(count: int) -> Callable[[Any], bool]:
-    """Whether the value is a list of `count` zeros."""
+    """Return whether the value is a list of `count` zeros."""
     return lambda value: list(value) == [0.0] * count
 
 
 def error(words: str) -> Callable[[Any], bool]:
-    """Whether the call raised an error containing these words."""
+    """Return whether the call raised an error containing these words."""
     return lambda value: isinstance(value, str) and words in value
 
 
@@ -86,7 +86,7 @@ def back(name: str) -> Callable[[Any], Any]:
 
 
 def no(value: Any) -> bool:
-    """Whether the call returned False."""
+    """Return whether the call returned False."""
     return value is False
 
 

@@ -75,7 +75,7 @@ def records_below(
 
 
 def field_comments(model: type[BaseModel]) -> dict[str, str]:
-    """What the code says of each field: among the docstring's attributes, or beside or right above it."""
+    """Return what the code says of each field: among the docstring's attributes, or beside or right above it."""
     out: dict[str, str] = {}
     for base in reversed(model.__mro__):
         if issubclass(base, BaseModel) and base is not BaseModel:

@@ -65,7 +65,7 @@ class PoseStream:
 
     @property
     def alive(self) -> bool:
-        """Whether the stream is alive, i.e. its newest sample is not stale."""
+        """Return whether the stream is alive, i.e. its newest sample is not stale."""
         return self.newest() is not None
 
     def newest(self) -> RobotSample | None:
@@ -101,7 +101,7 @@ class PoseStream:
             time.sleep(POLL_S)
 
     def _not_looking(self, now_s: float) -> bool:
-        """Whether this process was suspended, so that the age of a sample says nothing about the link."""
+        """Return whether this process was suspended, so that the age of a sample says nothing about the link."""
         return now_s - self._looked_s > STALL_S or now_s - self._looking_since_s <= self._stale_after_s
 
     def next(self) -> RobotSample:
@@ -214,5 +214,5 @@ def ringing_s(samples: Sequence[RobotSample], criteria: SettleCriteria) -> float
 
 
 def driven(sample: RobotSample) -> bool:
-    """Whether the controller drives the arm in this sample, i.e. any target joint velocity is not zero."""
+    """Return whether the controller drives the arm in this sample, i.e. any target joint velocity is not zero."""
     return bool(np.any(np.abs(sample.target_velocities_rad_s) > TARGET_AT_REST_RAD_S))

@@ -25,7 +25,7 @@ _REMEDIES = {
 
 
 def lacking_decoder(syntax: str) -> str | None:
-    """What to do about a known transfer syntax without a decoder here; None if it can be read, or is unknown.
+    """Return what to do about a known transfer syntax without a decoder here; None if it can be read, or is unknown.
 
     An unknown syntax is tried when its pixels are read.
     """

@@ -60,16 +60,16 @@ _UNITS = {
 
 
 def common_of(dataset: Dataset, groups: Sequence[Dataset]) -> Mapping[str, str]:
-    """What a slice states of each thing that must be equal in its series; "" where it states nothing."""
-    return {one.what: _stated(one, dataset, groups) for one in _EQUAL}
+    """Return what a slice states of each thing that must be equal in its series; "" where it states nothing."""
+    return {one.what: _text_of(one, dataset, groups) for one in _EQUAL}
 
 
 def value_unit(dataset: Dataset, groups: Sequence[Dataset], image_type: Sequence[str]) -> str:
-    """What the rescaled values are, in words; "" for Hounsfield units, which a CT image without a type has.
+    """Return what the rescaled values are, in words; "" for Hounsfield units, which a CT image without a type has.
 
     UNSPECIFIED for a file that says so, as GDCM makes it of one without a type.
     """
-    kind = _stated(_RESCALE_TYPE, dataset, groups).upper()
+    kind = _text_of(_RESCALE_TYPE, dataset, groups).upper()
     if kind == "US":
         return UNSPECIFIED
     if kind and kind not in _HOUNSFIELD:
@@ -80,7 +80,7 @@ def value_unit(dataset: Dataset, groups: Sequence[Dataset], image_type: Sequence
 
 
 def differences(slices: Sequence[tuple[str, Mapping[str, str]]]) -> list[str]:
-    """What must be equal in a series and is not, one text each, with the slices of each value.
+    """Return what must be equal in a series and is not, one text each, with the slices of each value.
 
     `slices`: the name of each slice, and what it states. A patient's data are compared, but not told.
     """
@@ -111,7 +111,7 @@ def _slices(names: Sequence[str]) -> str:
     return f"{len(names)} slice{'s' * (len(names) > 1)} ({', '.join(names[:_MOST_NAMED])}{more})"
 
 
-def _stated(attribute: _Attribute, dataset: Dataset, groups: Sequence[Dataset]) -> str:
+def _text_of(attribute: _Attribute, dataset: Dataset, groups: Sequence[Dataset]) -> str:
     places: list[Dataset] = []
     for group in groups:
         inside = group.get(attribute.sequence) if attribute.sequence else None

@@ -16,7 +16,7 @@ from drivers.dicom_folder.deidentify import deidentify
 from drivers.dicom_folder.files import dicom_files
 from drivers.dicom_folder.header_lines import header_lines
 from drivers.dicom_folder.headers import SEGMENTATION, SliceHeader, read_headers
-from drivers.dicom_folder.labels import placed
+from drivers.dicom_folder.labels import voxels_inside
 from drivers.dicom_folder.nifti import check_nifti, is_nifti, read_nifti
 from drivers.dicom_folder.pixels import hounsfield
 from drivers.dicom_folder.segmentation import read_segmentation
@@ -177,7 +177,7 @@ class DicomFolder:
             blocks = [block]
         else:
             blocks, names = read_segmentation(path, segments, volume.series.frame_of_reference)
-        inside = placed(blocks, (shape[0], shape[1], shape[2]), volume.T_ct_voxel, path)
+        inside = voxels_inside(blocks, (shape[0], shape[1], shape[2]), volume.T_ct_voxel, path)
         if not inside.any():
             raise UnreadableFileError(
                 f"the segments {', '.join(names)} are empty",

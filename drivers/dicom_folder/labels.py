@@ -26,7 +26,7 @@ class Block:
     Attributes:
         T_ct_block: (4, 4) maps indices along the array's axes, in their order, to metres in the ct frame.
         inside: array of three axes; a single slice has one element along its last axis.
-        name: of the slice, for messages; "" for the only block.
+        name: the slice's name, for messages; "" for the only block.
     """
 
     T_ct_block: Transform
@@ -34,7 +34,7 @@ class Block:
     name: str = ""
 
 
-def placed(
+def voxels_inside(
     blocks: Iterable[Block], shape: tuple[int, int, int], T_ct_voxel: Transform, where: Path
 ) -> NDArray[np.bool_]:
     """The union of the blocks on the voxels (K, J, I) of a series.
@@ -66,7 +66,7 @@ def _in_voxels(T_ct_voxel: Transform, T_ct_block: Transform) -> Transform:
 
 
 def _coincide(T_voxel_block: Transform, shape: tuple[int, ...]) -> bool:
-    """Whether the indices of a block are those of voxels, up to the order and the direction of axes."""
+    """Return whether the indices of a block are those of voxels, up to the order and the direction of axes."""
     whole = np.rint(T_voxel_block)
     if not np.isfinite(T_voxel_block).all() or np.abs(whole).max() > 1e6:
         return False

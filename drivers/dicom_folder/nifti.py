@@ -49,7 +49,7 @@ class _Header:
 
 
 def is_nifti(path: Path) -> bool:
-    """Whether a file is NIfTI by its name."""
+    """Return whether a file is NIfTI by its name."""
     return path.name.lower().endswith(NIFTI_SUFFIXES)
 
 
@@ -59,7 +59,7 @@ def check_nifti(path: Path) -> None:
         raise UnreadableFileError("it is not a NIfTI file", where=str(path), remedy=_AGAIN)
     header = _read_header(path)
     left = header.offset + header.data_bytes
-    with _opened(path) as file:
+    with _open_file(path) as file:
         while left > 0:
             left -= len(_bytes(path, file, min(left, _BLOCK_BYTES)))
 
@@ -70,7 +70,7 @@ def read_nifti(path: Path, segments: tuple[str, ...], most_voxels: int) -> tuple
     Args:
         path: a file of one three-dimensional image of whole numbers.
         segments: labels as text, such as "1"; empty: all but 0.
-        most_voxels: of the series.
+        most_voxels: the largest number of voxels of the series.
 
     Raises:
         IncompleteExportError: the file is cut short.
@@ -79,7 +79,7 @@ def read_nifti(path: Path, segments: tuple[str, ...], most_voxels: int) -> tuple
     header = _read_header(path)
     if header.voxels > most_voxels:
         raise _refused(path, f"it has {header.voxels:,} voxels, more than the series ({most_voxels:,})")
-    with _opened(path) as file:
+    with _open_file(path) as file:
         _bytes(path, file, header.offset)
         data = _bytes(path, file, header.data_bytes)
     values = np.frombuffer(data, dtype=np.dtype(header.kind)).reshape(header.shape, order="F")
@@ -98,7 +98,7 @@ def without_texts(source: Path, target: Path) -> tuple[str, ...]:
     """
     header = _read_header(source)
     removed: list[str] = []
-    with _opened(source) as file:
+    with _open_file(source) as file:
         head = bytearray(_bytes(source, file, header.offset))
         voxels = _bytes(source, file, header.data_bytes)
     for (start, length), name in zip(
@@ -115,7 +115,7 @@ def without_texts(source: Path, target: Path) -> tuple[str, ...]:
     return tuple(removed)
 
 
-def _opened(path: Path) -> IO[bytes]:
+def _open_file(path: Path) -> IO[bytes]:
     if path.name.lower().endswith(".gz"):
         return cast("IO[bytes]", gzip.open(path, "rb"))
     return path.open("rb")
@@ -141,7 +141,7 @@ def _bytes(path: Path, file: IO[bytes], count: int) -> bytes:
 
 
 def _read_header(path: Path) -> _Header:
-    with _opened(path) as file:
+    with _open_file(path) as file:
         head = _bytes(path, file, _HEADER_BYTES)
     order = next((o for o in "<>" if struct.unpack(f"{o}i", head[:4])[0] == _HEADER_BYTES), None)
     if order is None or head[344:348] != b"n+1\0":

@@ -28,7 +28,7 @@ def problems_of(
     """Why these slices do not form a uniform CT volume, one text per problem; empty if they do.
 
     Args:
-        headers: of the slices.
+        headers: the slices' headers.
         first_number: the number of the first slice of a whole series.
         unspecified_is_hounsfield: values whose unit the files state as unspecified are Hounsfield units.
     """
@@ -57,7 +57,7 @@ def problems_of(
             if (same := [h for h in headers if h.value_unit == unit])
         ),
         ("no rescale slope and intercept, so no Hounsfield units, in", [h for h in headers if h.rescale is None]),
-        ("no position, orientation or pixel spacing in", [h for h in headers if not _placed(h)]),
+        ("no position, orientation or pixel spacing in", [h for h in headers if not _has_place(h)]),
     ):
         if bad:
             problems.append(f"{text}: {_named(bad)}")
@@ -70,8 +70,8 @@ def problems_of(
     problems += _count_problems(headers, first_number)
     images = [header for header in headers if header.rows * header.columns > 0]
     bodies = [header for header in images if "LOCALIZER" not in header.image_type]
-    problems += differences([(header.file_name, _stated(header)) for header in bodies])
-    placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
+    problems += differences([(header.file_name, _common_values(header)) for header in bodies])
+    placed = [header for header in images if _has_place(header) and "LOCALIZER" not in header.image_type]
     if placed:
         problems += _shape_problems(placed) or _position_problems(placed)
     return tuple(problems)
@@ -85,14 +85,14 @@ def _other_unit(unit: str) -> str:
     return f"values that are not said to be Hounsfield units ({unit}; {remedy}) in"
 
 
-def _stated(header: SliceHeader) -> dict[str, str]:
+def _common_values(header: SliceHeader) -> dict[str, str]:
     # Further image types are a manufacturer's own words.
     kinds = {"image type": "\\".join(header.image_type[:3]), "unit of the values": header.value_unit or "HU"}
     return {**header.common, **kinds}
 
 
 def _count_problems(headers: Sequence[SliceHeader], first_number: int) -> list[str]:
-    """Whether slices are missing, by what the files state; for most series only that the first ones are."""
+    """Return whether slices are missing, by what the files state; for most series only that the first ones are."""
     problems: list[str] = []
     stated = max((header.stated_instances or 0 for header in headers), default=0)
     found = len({header.instance_uid for header in headers})
@@ -131,7 +131,7 @@ def acquired_images(headers: Sequence[SliceHeader]) -> int | None:
     return sum(stated.values())
 
 
-def _placed(header: SliceHeader) -> bool:
+def _has_place(header: SliceHeader) -> bool:
     return None not in (header.position_mm, header.orientation, header.pixel_spacing_mm)
 
 

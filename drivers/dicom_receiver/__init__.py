@@ -61,8 +61,8 @@ class ReceiverConfig:
     """How to listen.
 
     Attributes:
-        folder: of the CT suite's series.
-        ae_title: of this receiver; a sender that calls another one is refused.
+        folder: the folder for the CT suite's series.
+        ae_title: this receiver's title; a sender that calls another one is refused.
         host: address to listen on.
         port: 0 takes a free one.
         callers: AE titles that may send; empty: any.
@@ -137,7 +137,7 @@ class Receiver:
         for kind in _CLASSES:
             ae.add_supported_context(kind, list(_SYNTAXES))
         handlers: list[Any] = [
-            (evt.EVT_CONN_OPEN, self._opened),
+            (evt.EVT_CONN_OPEN, self._on_open),
             (evt.EVT_ACCEPTED, self._accepted),
             (evt.EVT_REJECTED, self._rejected),
             (evt.EVT_C_ECHO, self._echo),
@@ -162,7 +162,7 @@ class Receiver:
             self._server.ae.shutdown()
             self._server = None
 
-    def _opened(self, event: Any) -> None:
+    def _on_open(self, event: Any) -> None:
         """End the association at a message that is none, which would end pynetdicom's thread without a word."""
         messages = event.assoc.dimse
         receive: Callable[[object], None] = messages.receive_primitive

@@ -20,7 +20,7 @@ _AGAIN = "Send the whole series again; the files that are here already count"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a series when an association ended."""
+    """Holds what became of a series when an association ended."""
 
     series: str
     files: int  # of it, up to now

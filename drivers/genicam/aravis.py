@@ -63,7 +63,7 @@ class AravisCamera:
         return not self._is_network() or bool(is_controller(device(self._camera)))
 
     def _is_network(self) -> bool:
-        """Whether it is a camera of GigE Vision, whose images come in packets."""
+        """Return whether it is a camera of GigE Vision, whose images come in packets."""
         is_network = self._aravis.arv_camera_is_gv_device
         is_network.restype, is_network.argtypes = ctypes.c_int, (_POINTER,)
         return bool(is_network(self._camera))

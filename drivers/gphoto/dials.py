@@ -67,7 +67,7 @@ class Dials:
         if wanted != now:
             offered = self._link.choices(profile.white_balance.name)
             self.set(profile.white_balance.name, choose_word(profile.white_balance, wanted, offered, where))
-        for fixed, now in self._stated():
+        for fixed, now in self._differences():
             if fixed.needed:
                 self.set(fixed.name, fixed.words[0], fixed.otherwise)
                 continue
@@ -80,8 +80,8 @@ class Dials:
                 _LOG.warning("%s", error)
             _LOG.warning("%s is %s, and the camera does not let it be set: %s", fixed.name, now, fixed.otherwise)
 
-    def _stated(self) -> Iterator[tuple[Fixed, str]]:
-        """What the profile fixes and the body has otherwise, with the body's word."""
+    def _differences(self) -> Iterator[tuple[Fixed, str]]:
+        """Yield what the profile fixes and the body has otherwise, with the body's word."""
         names = self._link.names() if self._profile.fixed else frozenset[str]()
         for fixed in (one for one in self._profile.fixed if one.name in names):
             try:
@@ -100,10 +100,10 @@ class Dials:
             return False
 
     def wrong_by_hand(self) -> tuple[str, ...]:
-        """What the body has otherwise than the profile fixes it and software cannot set, as sentences."""
+        """Return what the body has otherwise than the profile fixes it and software cannot set, as sentences."""
         return tuple(
             f"{fixed.name} is {now}: {fixed.otherwise}"
-            for fixed, now in self._stated()
+            for fixed, now in self._differences()
             if not self._can_be_set(fixed)
         )
 
@@ -182,7 +182,7 @@ class Dials:
             self.set(widget.name, choose_number(widget, wanted, offered, self._link.where), widget.if_fixed)
 
     def _is_fixed_at(self, widget: Widget, means: Callable[[str], bool], wanted: str) -> bool:
-        """Whether the camera keeps a setting from being changed, and it already has the wanted value.
+        """Return whether the camera keeps a setting from being changed, and it already has the wanted value.
 
         Raises DeviceRefusedError if it has another one.
         """

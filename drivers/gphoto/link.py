@@ -269,7 +269,7 @@ class Link:
         return word
 
     def is_fixed(self, name: str) -> bool:
-        """Whether the camera says that this setting cannot be changed now."""
+        """Return whether the camera says that this setting cannot be changed now."""
         doing = f"Reading whether {name} can be set"
         return self.call(doing, lambda camera: bool(self._widget(camera, name).get_readonly()), optional=True)
 
@@ -295,7 +295,7 @@ class Link:
         self.call(f"Setting {name} to {value}", write)
 
     def summary(self) -> str:
-        """What libgphoto2 prints of the body with all its properties."""
+        """Return what libgphoto2 prints of the body with all its properties."""
         return self.call("Listing all properties", lambda camera: str(camera.get_summary().text), optional=True)
 
     def unlisted(self, code: str) -> PtpProperty:

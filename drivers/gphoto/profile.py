@@ -49,7 +49,7 @@ class Fixed:
     needed: bool = False  # whether nothing may be captured without it
 
     def suits(self, word: str) -> bool:
-        """Whether nothing has to be changed."""
+        """Return whether nothing has to be changed."""
         return word in self.words or word in self.not_in_question
 
 
@@ -86,11 +86,11 @@ class Profile:
     echoes: bool = False
 
     def fits(self, manufacturer: str, model: str) -> bool:
-        """Whether this profile is for a body of this name."""
+        """Return whether this profile is for a body of this name."""
         return manufacturer.startswith(self.manufacturer) and re.fullmatch(self.model, model) is not None
 
     def floats(self, white_balance: str) -> bool:
-        """Whether the camera chooses the white balance of each image by itself."""
+        """Return whether the camera chooses the white balance of each image by itself."""
         return white_balance in self.floating_white_balance
 
 
@@ -103,7 +103,7 @@ def number_of(word: str) -> float | None:
 
 
 def is_number(word: str, wanted: float) -> bool:
-    """Whether a camera's word means this number."""
+    """Return whether a camera's word means this number."""
     number = number_of(word)
     return number is not None and abs(number - wanted) <= RELATIVE_TOLERANCE * wanted
 

@@ -11,7 +11,7 @@ LEAST_FREE_BYTES = 200_000_000  # room for one RAW+JPEG exposure of 61 megapixel
 
 
 class Room:
-    """What the camera says of its memory and its cards, for files that are kept on `target`."""
+    """Holds what the camera says of its memory and its cards, for files that are kept on `target`."""
 
     def __init__(self, link: Link, profile: Profile, target: str) -> None:
         self._link, self._profile, self._target = link, profile, target
@@ -24,7 +24,7 @@ class Room:
             return None
 
     def problem(self, free_bytes: int | None, *, refused: bool = False) -> str:
-        """What is wrong with the space, as a sentence without a full stop; "" if enough or not known.
+        """Return what is wrong with the space, as a sentence without a full stop; "" if enough or not known.
 
         A full card also counts if the files go to the computer and the camera has `refused` to release.
         """

@@ -47,7 +47,7 @@ class GrblAxis(BaseModel):
 
     @property
     def turns(self) -> bool:
-        """Whether the axis turns; otherwise it slides."""
+        """Return whether the axis turns; otherwise it slides."""
         return self.from_deg is not None
 
     @property

@@ -49,7 +49,7 @@ class Axes:
         """The pose (4, 4) of the camera's mount at values (N,)."""
         carried = {"specimen": np.eye(4), "camera": np.eye(4)}
         for axis, value in zip(self.axes, values, strict=True):
-            carried[axis.carries] = carried[axis.carries] @ _moved(axis, float(value))
+            carried[axis.carries] = carried[axis.carries] @ _motion_of(axis, float(value))
         return inverse(carried["specimen"]) @ carried["camera"] @ self.T_base_flange_zero
 
     def nearest(self, T_base_flange: Transform, near: Array) -> tuple[Array, float, float]:
@@ -94,7 +94,7 @@ class Axes:
         return out
 
 
-def _moved(axis: GrblAxis, value: float) -> Transform:
+def _motion_of(axis: GrblAxis, value: float) -> Transform:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - as above
 
     direction = np.array(axis.direction) / np.linalg.norm(axis.direction)

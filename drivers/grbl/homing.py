@@ -22,7 +22,7 @@ def home(link: Link, newest: Callable[[], tuple[Status | None, float]], config: 
     the position is right: only the answer does.
 
     Args:
-        link: to the controller, which was just reset.
+        link: the link to the controller, which was just reset.
         newest: the newest report, and when it was asked for, monotonic.
         config: how long homing and an answer may take.
 

@@ -163,7 +163,7 @@ class Link:
             return len(self._waiting)
 
     def misses_answer(self, within_s: float) -> bool:
-        """Whether the oldest line without an answer was sent longer ago than this."""
+        """Return whether the oldest line without an answer was sent longer ago than this."""
         with self._news:
             return bool(self._waiting) and time.monotonic() - self._waiting[0].sent_s > within_s
 

@@ -69,7 +69,7 @@ class Mover:
 
     @property
     def moving(self) -> bool:
-        """Whether a motion is under way."""
+        """Return whether a motion is under way."""
         return self._motion is not None
 
     @property
@@ -79,7 +79,7 @@ class Mover:
 
     @property
     def driven(self) -> bool:
-        """Whether the controller drives the axes."""
+        """Return whether the controller drives the axes."""
         return self.status is not None and (self.status.state in _DRIVEN or self.status.state == "Hold")
 
     @property
@@ -92,7 +92,7 @@ class Mover:
 
     @staticmethod
     def at_rest(status: Status) -> bool:
-        """Whether nothing moves in this report."""
+        """Return whether nothing moves in this report."""
         return status.state not in (*_DRIVEN, "Hold", "Door") or (status.state, status.substate) in (
             ("Hold", 0), ("Door", 0), ("Door", 1),
         )  # fmt: skip

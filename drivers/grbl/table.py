@@ -349,7 +349,7 @@ class GrblTable:
             time.sleep(0.005)
 
     def _shown_since(self, asked_s: float) -> bool:
-        """Whether the newest sample is of a report that was asked for then or later."""
+        """Return whether the newest sample is of a report that was asked for then or later."""
         newest = self._streaming().newest()
         return newest is not None and newest.monotonic_s >= asked_s
 

@@ -29,7 +29,7 @@ class Note:
         self._ends: Counter[str] = Counter()
 
     def read(self) -> str:
-        """What the process is doing, or was when it ended; "" if it has not said it."""
+        """Return what the process is doing, or was when it ended; "" if it has not said it."""
         return self._memory[:_NOTE_BYTES].rstrip(b"\0").decode(errors="replace")
 
     def clear(self) -> None:
@@ -44,7 +44,7 @@ class Note:
 
     @property
     def left_out(self) -> frozenset[str]:
-        """What has ended a process too often."""
+        """Return what has ended a process too often."""
         return frozenset(what for what, ends in self._ends.items() if ends >= MOST_ENDS)
 
 
@@ -60,13 +60,13 @@ class _Told:
         """Say it, cut at what the note can hold."""
         self.now = what
         if self.memory is not None:
-            self.memory[:_NOTE_BYTES] = _cut(what).encode().ljust(_NOTE_BYTES, b"\0")
+            self.memory[:_NOTE_BYTES] = _shorten(what).encode().ljust(_NOTE_BYTES, b"\0")
 
 
 _TOLD = _Told()
 
 
-def _cut(what: str) -> str:
+def _shorten(what: str) -> str:
     return what.encode()[:_NOTE_BYTES].decode(errors="ignore")
 
 
@@ -86,7 +86,7 @@ def doing(what: str, *, where: str = "", optional: bool = False) -> Generator[No
 
     Raises DeviceRefusedError if it is optional and has ended the driver's process twice.
     """
-    if optional and _cut(what) in _TOLD.left_out:
+    if optional and _shorten(what) in _TOLD.left_out:
         raise DeviceRefusedError(
             f"{what} has ended the driver's process {MOST_ENDS} times and is left out",
             where=where,

@@ -214,7 +214,7 @@ class HostedDevice:
         """Run one method of the driver in the child and return its result.
 
         Raises:
-            OrthocaptureError: as raised by the driver.
+            OrthocaptureError: the driver raised it.
             DeviceFaultError: the driver raised any other exception.
             DeviceTimeoutError: no answer within the call timeout; the child was killed.
             MachineBusyError: the same, and the machine had kept the child from running.

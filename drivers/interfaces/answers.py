@@ -66,7 +66,7 @@ class FileHeader(Part):
 
 
 class DeviceAnswers(Part):
-    """What a device said; each driver fills what its device has."""
+    """Holds what a device said; each driver fills what its device has."""
 
     listing: Listing | None = None
     exchanges: tuple[Exchange, ...] = ()

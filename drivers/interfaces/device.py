@@ -47,7 +47,7 @@ class DeviceReport:
 
 @runtime_checkable
 class Device(Protocol):
-    """What every driver provides. Methods raise only drivers.errors.DeviceError."""
+    """Declares what every driver provides. Methods raise only drivers.errors.DeviceError."""
 
     def open(self) -> DeviceIdentity:
         """Connect, check the version and return the device's identity. Calling it again reconnects."""

@@ -22,13 +22,13 @@ class SafetyState(Enum):
 
     @property
     def may_move(self) -> bool:
-        """Whether motion may be commanded in this state."""
+        """Return whether motion may be commanded in this state."""
         return self in (SafetyState.NORMAL, SafetyState.REDUCED)
 
 
 @dataclass(frozen=True, slots=True)
 class Abandoned:
-    """What becomes of a motion whose program died: the controller notices, and the arm brakes."""
+    """Says what becomes of a motion whose program died: the controller notices, and the arm brakes."""
 
     noticed_after_s: float  # until the controller ends the motion
     rest_within_s: float  # longest time that the site allows until the arm stands

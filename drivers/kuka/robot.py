@@ -192,7 +192,7 @@ class KukaRobot:
         ]
 
     def answers(self) -> DeviceAnswers:
-        """What the application greeted with, and the newest line of its stream."""
+        """Return what the application greeted with, and the newest line of its stream."""
         link, state = self._linked(), self._newest()
         greeting = json.dumps(dataclasses.asdict(link.hello))
         now = f"mode {state.mode}, safety {state.safety.value}, ready {state.ready}, locked {state.locked}"
@@ -379,7 +379,7 @@ class KukaRobot:
         return None
 
     def _obstacle(self) -> DeviceError | None:
-        """What prevents the arm from moving until a person resolves it; None if nothing does."""
+        """Return what prevents the arm from moving until a person resolves it; None if nothing does."""
         sample = self._streaming().latest()
         if not sample.safety.may_move:
             return self._safety_error(sample)

@@ -134,7 +134,7 @@ def flange_words(T_base_flange: Transform) -> str:
 
 
 def agree(answer: object, values: list[float]) -> bool:
-    """Whether the controller's answer, a number or a list of numbers, equals the values."""
+    """Return whether the controller's answer, a number or a list of numbers, equals the values."""
     try:
         found = np.atleast_1d(np.asarray(answer, dtype=np.float64))
     except (ValueError, TypeError):

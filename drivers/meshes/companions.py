@@ -67,7 +67,7 @@ def numbered_textures(path: Path, at_least: int) -> list[Path]:
 
 def _numbered(path: Path, number: int) -> Path | None:
     names = (f"{path.stem}_{number}{suffix}" for suffix in TEXTURE_SUFFIXES)
-    return next((here for name in names if (here := _found(path.parent, name, os.fsencode(name))) is not None), None)
+    return next((here for name in names if (here := _find(path.parent, name, os.fsencode(name))) is not None), None)
 
 
 def companion_names(content: bytes) -> Iterator[str]:
@@ -116,7 +116,7 @@ def _beside(path: Path, raw: bytes, named_in: Path | None = None) -> Path:
             where=str(source),
             remedy="Export into a folder of its own, with the textures beside the mesh",
         )
-    here = next((found for name in inside if (found := _found(path.parent, name, raw)) is not None), None)
+    here = next((found for name in inside if (found := _find(path.parent, name, raw)) is not None), None)
     if here is None:
         raise IncompleteExportError(
             f"its companion {inside[0]!r} is missing",
@@ -138,7 +138,7 @@ def _leads_out(name: str) -> bool:
     return bool(odd) or not windows.parts
 
 
-def _found(folder: Path, name: str, raw: bytes) -> Path | None:
+def _find(folder: Path, name: str, raw: bytes) -> Path | None:
     here = folder
     for part in PureWindowsPath(name).parts:
         try:

@@ -115,7 +115,7 @@ def numbers(
 
 
 def is_number(word: bytes, kind: type[np.float64] | type[np.int64] = np.float64) -> bool:
-    """Whether `numbers` takes a word for a number."""
+    """Return whether `numbers` takes a word for a number."""
     try:
         kind(word)
     except (ValueError, OverflowError):

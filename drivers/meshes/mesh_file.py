@@ -48,10 +48,10 @@ def read_mesh_file(
 
     Args:
         path: an OBJ, PLY or STL (ASCII or binary) file.
-        unit: of the file; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A unit
-            that contradicts the size is an error, never silently corrected.
+        unit: the file's unit; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A
+            unit that contradicts the size is an error, never silently corrected.
         export: the export that the file belongs to; found beside the file if not given.
-        any_size: as `credible_unit` takes it.
+        any_size: the argument of `credible_unit`.
 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
@@ -180,7 +180,7 @@ def mesh_findings(vertices: Array, faces: IntArray) -> dict[str, float]:
 
 
 def _used(index: NDArray[np.integer], n: int) -> NDArray[np.bool_]:
-    """Which of 0…n-1 occur among these indices, (n,): in a tenth of the time of np.unique."""
+    """Return which of 0…n-1 occur among these indices, (n,): in a tenth of the time of np.unique."""
     used = np.zeros(n, dtype=np.bool_)
     used[index] = True
     return used
@@ -268,7 +268,7 @@ def _without_holes(raw: RawMesh) -> RawMesh:
 
 
 def _valid(raw: RawMesh) -> bool:
-    """Whether nearly all normals of vertices that have a face are of unit length."""
+    """Return whether nearly all normals of vertices that have a face are of unit length."""
     if raw.normals is None:
         return True
     length = np.linalg.norm(raw.normals[_used(raw.faces, len(raw.vertices))], axis=1)

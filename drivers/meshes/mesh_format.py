@@ -122,7 +122,7 @@ def _least_bytes(element: Element) -> int:
 
 
 def _last_row_short(path: Path, element: Element) -> bool:
-    """Whether values are missing in the last line of an ASCII PLY that does not end with a newline."""
+    """Return whether values are missing in the last line of an ASCII PLY that does not end with a newline."""
     words = _tail(path).splitlines()[-1].split()
     at = 0
     for one in element.properties:

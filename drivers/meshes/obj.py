@@ -20,7 +20,7 @@ _LEAST = {_V: 3, _VT: 1, _VN: 3}  # numbers in a line; a texture may have one di
 
 @dataclass
 class _Collected:
-    """What was read so far: for each kind of line the parts of its table, and how many rows they have."""
+    """Holds what was read so far: for each kind of line the parts of its table, and how many rows they have."""
 
     parts: dict[int, list[Array]] = field(default_factory=lambda: {_V: [], _VT: [], _VN: []})
     rows: dict[int, int] = field(default_factory=lambda: {_V: 0, _VT: 0, _VN: 0})
@@ -80,7 +80,7 @@ class _Lines:
         return np.diff(np.concatenate([[0], np.cumsum(begins)[self.ends]]))
 
     def begins(self, *separators: int) -> NDArray[np.bool_]:
-        """Where words begin that these characters separate."""
+        """Return where words begin that these characters separate."""
         apart = np.isin(self.text, separators)
         begins = ~apart
         begins[1:] &= apart[:-1]
@@ -127,7 +127,7 @@ def _read_block(block: bytes, read: _Collected) -> None:
 
 
 def _comments(text: NDArray[np.uint8], starts: IntArray, ends: IntArray) -> NDArray[np.bool_]:
-    """Where comments are: from each `#` to the end of its line."""
+    """Return where comments are: from each `#` to the end of its line."""
     hashes = np.flatnonzero(text == _HASH)
     lines, at = np.unique(np.searchsorted(starts, hashes, side="right") - 1, return_index=True)
     change = np.zeros(len(text) + 1, dtype=np.int8)

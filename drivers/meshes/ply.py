@@ -154,7 +154,7 @@ def read_rows(path: Path) -> dict[str, Rows]:
     Raises:
         IncompleteExportError: the file is cut short.
         ValueError: it does not hold what its header announces.
-        UnreadableFileError: as read_header does.
+        UnreadableFileError: read_header raises it.
         OSError: it cannot be read.
     """
     try:

@@ -28,7 +28,7 @@ class PointCloud:
     Attributes:
         points_m: (N, 3).
         normals: (N, 3) unit vectors, or None if the file has none.
-        unit: of the file.
+        unit: the file's unit.
         unit_evidence: how that unit was determined.
     """
 
@@ -39,7 +39,7 @@ class PointCloud:
 
 
 def is_point_cloud(path: Path) -> bool:
-    """Whether a file holds points without faces, judged by its extension or its PLY header."""
+    """Return whether a file holds points without faces, judged by its extension or its PLY header."""
     if path.suffix.lower() in TEXT_SUFFIXES:
         return True
     if path.suffix.lower() != ".ply":

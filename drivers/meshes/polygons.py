@@ -16,7 +16,7 @@ _FLAT = 1e-12  # of a polygon's area: what is smaller is no area, but the roundi
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """What polygons were cut into.
+    """Holds what polygons were cut into.
 
     Attributes:
         at: (F, 3) places in the list of corners, in the order of the polygons and of their winding.

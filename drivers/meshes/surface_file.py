@@ -26,7 +26,7 @@ class SurfaceFile:
         vertices_m: (V, 3), metres.
         faces: (F, 3); (0, 3) for a point cloud.
         normals: (V, 3) unit normals of a cloud's points; None if it has none, and for a mesh.
-        unit: of the file, mm or m.
+        unit: the file's unit, mm or m.
         unit_evidence: how it was determined.
         polygons_in_doubt: polygons of a mesh that have no inside to speak of.
     """
@@ -44,8 +44,8 @@ def read_surface_file(path: Path, unit: MeshUnit = "auto") -> SurfaceFile:
 
     Args:
         path: the file.
-        unit: of the file; `auto` takes a bounding box of at most LARGEST_IN_METRES units as metres, a larger one as
-            millimetres. Unlike a scan, what is compared may have any size.
+        unit: the file's unit; `auto` takes a bounding box of at most LARGEST_IN_METRES units as metres, a larger one
+            as millimetres. Unlike a scan, what is compared may have any size.
 
     Raises:
         IncompleteExportError: the file is truncated.

@@ -128,7 +128,7 @@ def read_exif(path: Path) -> ExifRecord:
     size = _jpeg_size(path)
     try:
         with reading(path, "a photograph", "Copy it again from the camera"):
-            return _stated(path, size)
+            return _read_record(path, size)
     except UnreadableFileError as error:
         if size is None:
             raise
@@ -139,7 +139,7 @@ def read_exif(path: Path) -> ExifRecord:
         )  # fmt: skip
 
 
-def _stated(path: Path, size: tuple[int, int] | None) -> ExifRecord:
+def _read_record(path: Path, size: tuple[int, int] | None) -> ExifRecord:
     image = exiv2.ImageFactory.open(str(path))
     image.readMetadata()
     exif = image.exifData()
@@ -155,7 +155,7 @@ def _stated(path: Path, size: tuple[int, int] | None) -> ExifRecord:
         exposure_s=_number(exif, "exposure"),
         iso=_integer(exif, "iso"),
         focal_length_mm=_number(exif, "focal_length"),
-        taken=_taken(exif),
+        taken=_time_taken(exif),
         orientation=_integer(exif, "orientation") or 1,
         width=width,
         height=height,
@@ -212,7 +212,7 @@ def _integer(exif: Any, name: str) -> int | None:
     return None if found is None or found.typeId() in _TEXTS else int(found.toInt64())
 
 
-def _taken(exif: Any) -> str:
+def _time_taken(exif: Any) -> str:
     moment, subseconds = _text(exif, "taken"), _text(exif, "subseconds")
     if not moment:
         return ""

@@ -60,7 +60,7 @@ def _text(value: Any, indent: str = "") -> str:
 
 
 def _is_flat(value: Any) -> bool:
-    """Whether it is a list of numbers, or a property, however many choices it has."""
+    """Return whether it is a list of numbers, or a property, however many choices it has."""
     if isinstance(value, dict):
         return "code" in value
     return all(isinstance(part, int | float) for part in cast("list[Any]", value))

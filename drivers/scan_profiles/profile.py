@@ -16,7 +16,7 @@ class ScanProfile:
         software: the program that exports.
         units: the unit of each format that is read, by the extension in lower case. A file whose size contradicts it
             is refused, never scaled. E57 is in metres by its standard.
-        advice: what to choose in that program, for messages.
+        advice: the setting to choose in that program, for messages.
         views: sizes (columns, rows) of a single view that is exported as points in the order of the sensor's pixels,
             row by row; empty if the program exports meshes only. In a view's frame the sensor is at the origin and
             looks along +z; points that were not measured are not finite or exactly zero.

@@ -32,14 +32,14 @@ def read_export(profile: ScanProfile, export: ScanExport, unit: MeshUnit = "auto
     """Read an export, in metres.
 
     Args:
-        profile: of the scanner that made it.
+        profile: the profile of the scanner that made it.
         export: the file and its companions.
-        unit: of the file; `auto`: as the profile says.
+        unit: the file's unit; `auto`: the profile's.
 
     Raises:
         IncompleteExportError: truncated, still growing or locked.
-        UnreadableFileError: as read_mesh_file; points that are not in the order of the sensor's pixels; a view in
-            another frame than the sensor's.
+        UnreadableFileError: read_mesh_file raises it; points that are not in the order of the sensor's pixels; a view
+            in another frame than the sensor's.
         DriverMissingError: an E57 file, and pye57 is not installed.
     """
     path = export.files[0]

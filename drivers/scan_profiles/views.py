@@ -56,7 +56,7 @@ def view_mesh(view: View) -> tuple[Array, NDArray[np.int64], Array | None]:
 
 
 def looks_along_z(view: View) -> bool:
-    """Whether the points lie in front of the sensor; if not, another frame or a mirrored axis was exported."""
+    """Return whether the points lie in front of the sensor; if not, another frame or a mirrored axis was exported."""
     z = view.points[..., 2]
     z = z[np.isfinite(z)]
     return len(z) > 0 and float(np.mean(z > 0)) > 0.99

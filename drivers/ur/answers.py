@@ -15,7 +15,7 @@ def answers_of(
     host: str, dashboard: Dashboard, receive: library.Receive | None, *, kinematics_s: float
 ) -> DeviceAnswers:
     """Ask the dashboard and the primary interface, and read one sample of the stream if it is open."""
-    exchanges, unanswered = dashboard.said()
+    exchanges, unanswered = dashboard.ask_all()
     silent = list(unanswered)
     samples: list[Sample] = []
     try:

@@ -44,7 +44,7 @@ _SHOWN = 120  # characters of an unexpected answer in messages
 
 @dataclass(frozen=True, slots=True)
 class ControllerFacts:
-    """What the dashboard reports about a controller."""
+    """Holds what the dashboard reports about a controller."""
 
     model: str
     serial: str
@@ -85,7 +85,7 @@ class Dashboard:
         letter = "e" if version[0] >= 5 and model in _E_SERIES else ""
         return ControllerFacts(f"{model}{letter}", serial, match.group(0), version)
 
-    def said(self) -> tuple[tuple[Exchange, ...], tuple[str, ...]]:
+    def ask_all(self) -> tuple[tuple[Exchange, ...], tuple[str, ...]]:
         """The answers to all questions that change nothing, and why some got none; a dead server is not asked on."""
         exchanges: list[Exchange] = []
         silent: list[str] = []

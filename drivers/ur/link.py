@@ -20,7 +20,7 @@ def vendor(where: str, doing: str) -> Generator[None]:
 
     Args:
         where: address of the controller, for the message.
-        doing: what is being attempted, as in "reading the state".
+        doing: the attempt in words, as in "reading the state".
     """
     try:
         yield

@@ -51,7 +51,7 @@ class ControllerKinematics:
         return float(np.linalg.norm((there - flange_pose(published, joints_rad))[:3, 3]))
 
     def words(self, published: ArmModel | None, joints_rad: Array) -> str:
-        """What to report of it, with the arm at these joints (6,)."""
+        """Return what to report of it, with the arm at these joints (6,)."""
         if published is None:
             return "stated, for an arm that is not known here"
         away_m = self.departure_m(published, joints_rad)

@@ -46,7 +46,7 @@ from drivers.ur.samples import (
     SampleReader,
     joint_values,
     joints_for,
-    opened,
+    require_open,
     robot_mode,
     speed_fraction,
 )
@@ -178,7 +178,7 @@ class UrRobot:
         return answers_of(self._where, self._dashboard, self._samples.receive, kinematics_s=KINEMATICS_S)
 
     def _identity(self) -> DeviceIdentity:
-        facts = opened(self._facts, self._where)
+        facts = require_open(self._facts, self._where)
         library = f"ur_rtde {importlib.metadata.version('ur-rtde')}"
         version = f"{DRIVER_VERSION} ({library})"
         return DeviceIdentity("robot", facts.model, facts.serial, facts.software, "ur", version, self._where)
@@ -225,7 +225,7 @@ class UrRobot:
             settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
             while self._streaming().next().controller_time_s < settled_s:
                 pass
-            receive = opened(self._samples.receive, self._where)
+            receive = require_open(self._samples.receive, self._where)
             read_back(
                 lambda: abs(receive.getPayload() - payload.mass_kg) < 1e-6,
                 f"payload of {payload.mass_kg:g} kg",
@@ -245,7 +245,7 @@ class UrRobot:
         """Return the newest sample with the controller's modes. Raises DeviceUnavailableError if it is stale."""
         self._watchdog.attend()
         sample = self._streaming().latest()
-        receive = opened(self._samples.receive, self._where)
+        receive = require_open(self._samples.receive, self._where)
         with vendor(self._where, "reading the state"):
             return RobotState(
                 sample=sample,
@@ -321,7 +321,7 @@ class UrRobot:
         return False
 
     def _driven(self, sample: RobotSample) -> bool:
-        """Whether the controller drives the arm in this sample. Raises SafetyStopError if it shows a stop."""
+        """Return whether the controller drives the arm in this sample. Raises SafetyStopError if it shows a stop."""
         if not sample.safety.may_move:
             raise safety_error(sample.safety, self._where)
         return driven(sample)
@@ -344,14 +344,14 @@ class UrRobot:
     # --- parts -------------------------------------------------------------------------------------------
 
     def _streaming(self) -> PoseStream:
-        return opened(self._stream, self._where)
+        return require_open(self._stream, self._where)
 
     def _newest(self) -> RobotSample | None:
         stream = self._stream  # another thread may set it to None
         return stream.newest() if stream is not None else None
 
     def _obstacle(self) -> DeviceError | None:
-        """What prevents the arm from moving until a person resolves it; None if nothing does."""
+        """Return what prevents the arm from moving until a person resolves it; None if nothing does."""
         state = self.state()
         if not state.sample.safety.may_move:
             return safety_error(state.sample.safety, self._where)
@@ -359,7 +359,7 @@ class UrRobot:
             remedy = "Power the arm on and release its brakes on the pendant"
             return DeviceRefusedError(f"the arm is in mode {state.robot_mode}", where=self._where, remedy=remedy)
         # A controller in local control sends what it measures, and starts no program: one that runs was let start.
-        return self._dashboard.obstacle(opened(self._facts, self._where).version, running=state.program_running)
+        return self._dashboard.obstacle(require_open(self._facts, self._where).version, running=state.program_running)
 
     def _end_others(self) -> None:
         self._dashboard.end_program(lambda: self.state().program_running)

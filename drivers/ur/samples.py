@@ -211,7 +211,7 @@ def joint_values(values: Array, where: str) -> list[float]:
     return [float(v) for v in joints]
 
 
-def opened(part: T | None, where: str) -> T:
+def require_open(part: T | None, where: str) -> T:
     """A part of the connection. Raises DeviceUnavailableError if the arm is not connected."""
     if part is None:
         raise DeviceUnavailableError("the robot is not connected", where=where, remedy="Open it first")

@@ -28,7 +28,7 @@ class ControlScript:
     The first command connects and sends it. It is sent again after it ended, unless the latch holds the arm.
 
     Args:
-        config: of the arm.
+        config: the arm's configuration.
         latch: holds the arm after a stop.
         watchdog: guards the script.
         end_others: ends another program that runs at the controller. Raises DeviceError.
@@ -47,7 +47,7 @@ class ControlScript:
         """Yield the control interface with its script running, for commands.
 
         Args:
-            doing: what the commands do, for error messages.
+            doing: the commands' purpose, for error messages.
             hold: why the arm may not be commanded; raised if not None.
         """
         with self._watchdog.commanding():
@@ -106,11 +106,11 @@ class ControlScript:
 
     @property
     def connected(self) -> bool:
-        """Whether the control interface has been connected."""
+        """Return whether the control interface has been connected."""
         return self._control is not None
 
     def moves(self) -> bool:
-        """Whether the script reports a motion in progress."""
+        """Return whether the script reports a motion in progress."""
         control = self._control
         with vendor(self._where, "asking for the motion's progress"):
             return (

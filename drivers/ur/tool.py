@@ -135,7 +135,7 @@ class ToolWatch:
 
 
 def jumped(away: tuple[float, float], turned_rad: float, *, known: bool) -> bool:
-    """Whether the tool of two samples in a row differs by more than the motion between them explains.
+    """Return whether the tool of two samples in a row differs by more than the motion between them explains.
 
     Args:
         away: how far the one is from the other, m and rad.

@@ -78,7 +78,7 @@ class Watchdog:
 
     @property
     def guarding(self) -> bool:
-        """Whether a control script is guarded: it runs, as far as is known."""
+        """Return whether a control script is guarded: it runs, as far as is known."""
         return self._control is not None
 
     def release(self) -> None:
@@ -108,7 +108,7 @@ class Watchdog:
 
     @property
     def moving(self) -> bool:
-        """Whether a motion was started whose end has not been observed yet."""
+        """Return whether a motion was started whose end has not been observed yet."""
         return self._moving
 
     def attend(self) -> None:
@@ -140,7 +140,7 @@ class Watchdog:
             self._latch.end(what)
 
     def lapsed(self) -> bool:
-        """Whether the script ended while the arm stood still, because this machine was briefly busy.
+        """Return whether the script ended while the arm stood still, because this machine was briefly busy.
 
         Raises the vendor's errors.
         """

@@ -8,6 +8,7 @@ from pathlib import Path
 from service.core.errors import ProtocolError
 
 _FOLDER = "protocols"
+PROTOCOL_HELP = "The protocol file, or the name of a shipped one, such as exvivo_spine."
 
 
 def shipped_protocols() -> Path:
@@ -21,7 +22,7 @@ def protocol_file(named: Path) -> Path:
     `exvivo_spine`, `exvivo_spine.yaml` and `protocols/exvivo_spine.yaml` name the same one, wherever the command is
     given. Raises ProtocolError, which lists the names, if there is neither.
     """
-    if named.exists() or named.parent.as_posix() not in (".", _FOLDER):
+    if named.is_file() or named.parent.as_posix() not in (".", _FOLDER):
         return named
     shipped = {path.name: path for path in sorted(shipped_protocols().glob("*.yaml"))}
     found = shipped.get(named.name) or shipped.get(f"{named.name}.yaml")
@@ -29,6 +30,6 @@ def protocol_file(named: Path) -> Path:
         raise ProtocolError(
             "there is no such file, and no protocol of this name comes with orthocapture",
             where=str(named),
-            remedy=f"Check the path, or name one of {', '.join(shipped)}",
+            remedy=f"Check the path, or name one of {', '.join(path.stem for path in shipped.values())}",
         )
     return found

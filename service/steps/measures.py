@@ -141,7 +141,9 @@ class LayoutMeasures(MeasureRecord):
         FineMm, "misfit of the best wrong assignment of four spheres: how far they are from being mistaken"
     ] = None
     layout_margin_of_five_mm: Annotated[FineMm, "misfit of the best wrong assignment of five spheres"] = None
-    layout_margin_sigma_mm: Annotated[FineMm, "standard deviation of `layout_margin_mm`"] = None
+    layout_margin_sigma_mm: Annotated[FineMm, "standard deviation of the margin against confusing four spheres"] = (
+        None
+    )
     layout_depth_mm: Annotated[Mm, "depth of the layout across its best plane"] = None
     layout_gap_deg: Annotated[Deg, "largest angle around the centre of the scene without a sphere"] = None
     layout_problems: Annotated[Count, "findings about the layout that fall short of what is required"] = None
@@ -183,7 +185,9 @@ class SphereMeasures(LayoutMeasures):
         "by how much distances between spheres are larger here than in the earlier mesh: one of two scanners may err",
     ] = None
     sphere_scale_sigma_percent: Annotated[
-        float | None, Measure("%", 1e-4, 5), "standard deviation of `sphere_scale_percent`"
+        float | None,
+        Measure("%", 1e-4, 5),
+        "standard deviation of the difference in scale between here and the earlier mesh",
     ] = None
 
 
@@ -204,6 +208,4 @@ class PredictedMeasures(MeasureRecord):
     predicted_target_error_mm: Annotated[
         ErrorMm, "predicted error of the registration at the worst point of the specimen"
     ] = None
-    specimen_coverage: Annotated[
-        Share, "share of the specimen's surface that enough images see well (see `coverage` of the step)"
-    ] = None
+    specimen_coverage: Annotated[Share, "share of the specimen's surface that enough images see well"] = None

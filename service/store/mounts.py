@@ -55,11 +55,11 @@ def require_own_mount(folder: Path) -> None:
 
 def why_unsafe(folder: Path) -> str:
     """Why a database in a folder would lose data, in words that follow "the data folder is"; "" if it would not."""
-    return _found(folder.resolve(), folder.stat().st_dev)
+    return _find(folder.resolve(), folder.stat().st_dev)
 
 
 @lru_cache(maxsize=64)  # once for each folder of a device
-def _found(folder: Path, _device: int) -> str:
+def _find(folder: Path, _device: int) -> str:
     kind = file_system(folder)
     if kind in _SHARED:
         return f"on a file system that other machines can mount too ({kind})"
@@ -80,7 +80,7 @@ def file_system(folder: Path) -> str:
 
 
 def _why_no_locks(folder: Path) -> str:
-    """What fails of locks and shared memory where it is tried, in words; "" if nothing does."""
+    """Return what fails of locks and shared memory where it is tried, in words; "" if nothing does."""
     try:
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".probe-") as one, Path(one.name).open("r+b") as other:
             _lock(one.fileno())
@@ -110,7 +110,7 @@ def _lock(descriptor: int) -> None:
 
 
 def _locked(descriptor: int) -> bool:
-    """Whether another opening of the file holds the lock."""
+    """Return whether another opening of the file holds the lock."""
     try:
         _lock(descriptor)
     except (BlockingIOError, PermissionError):

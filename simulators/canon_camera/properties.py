@@ -161,9 +161,9 @@ class Properties:
     def tell(self, number: int) -> None:
         """Tell the value of one property again. Raises NotWritableError if there is none."""
         with self._lock:
-            self._news += self._value_of(self._known(number))
+            self._news += self._value_of(self._code_of(number))
 
-    def _known(self, number: int) -> Code:
+    def _code_of(self, number: int) -> Code:
         try:
             return Code(number)
         except ValueError as error:
@@ -173,7 +173,7 @@ class Properties:
         """Set a value: size, code, value. Raises NotWritableError or RefusedValueError."""
         if len(data) < 12 or struct.unpack_from("<I", data)[0] != len(data):
             raise RefusedValueError(f"{len(data)} bytes are not a value")
-        code = self._known(struct.unpack_from("<I", data, 4)[0])
+        code = self._code_of(struct.unpack_from("<I", data, 4)[0])
         if code is Code.IMAGE_FORMAT:
             chosen = next((one for one in FORMATS if one.encode() == data[8:]), None)
             if chosen is None:

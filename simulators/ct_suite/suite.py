@@ -20,7 +20,7 @@ from simulators.ct_suite.volume import Grid, grid_around, voxelise
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, inverse
 from simulators.scene.world import Scene, parse_moved
-from simulators.serve import Request, SimulatorError, Termination, announce, told
+from simulators.serve import Request, SimulatorError, Termination, announce, wait_for_line
 from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
@@ -30,13 +30,13 @@ RESCALE_INTERCEPT = -1024
 
 @dataclass(frozen=True, slots=True)
 class Product:
-    """What a photon-counting suite computes from an acquisition, besides the others, into the same folder.
+    """Holds what a photon-counting suite computes from an acquisition, besides the others, into the same folder.
 
     Attributes:
-        description: as a NAEOTOM Alpha writes it.
+        description: the series' description, as a NAEOTOM Alpha writes it.
         image_type: its fourth value.
         above_water: factor of the Hounsfield units above 0, as these depend on the energy.
-        suffix: of its files.
+        suffix: the suffix of its files.
     """
 
     description: str
@@ -120,7 +120,7 @@ def _scan(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> None:
     T_world_ct, T_world_gantry = true_frames(scene.seed)
     grid = grid_around(scene, T_world_gantry, metres(args.voxel_mm), control_spheres=args.control_spheres)
     volume = voxelise(scene, grid, control_spheres=args.control_spheres)
-    if announce_it and args.when_told and not told():
+    if announce_it and args.when_told and not wait_for_line():
         return
     folder: Path = args.folder
     series = generate_uid(entropy_srcs=[str(scene.seed), str(args.voxel_mm), str(time.time_ns())])

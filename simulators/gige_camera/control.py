@@ -126,6 +126,6 @@ class ControlServer:
         self._written(address)
 
     def _is_controlled(self) -> bool:
-        """Whether a client has control and was heard within the time of its heartbeat."""
+        """Return whether a client has control and was heard within the time of its heartbeat."""
         silent_s = time.monotonic() - self._heard_s
         return self._controller is not None and ms(silent_s) < self._registers.get(HEARTBEAT_MS)

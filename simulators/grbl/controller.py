@@ -25,7 +25,7 @@ class Controller:
     """A controller and its end of the line.
 
     Args:
-        machine: what it drives.
+        machine: the machine that it drives.
         send: sends bytes to the host.
         faults: which messages fail; the device is `grbl`, messages are `?`, `jog`, or the line itself.
     """
@@ -261,7 +261,7 @@ class Controller:
         return 0
 
     def _target(self, axes: list[tuple[str, float]], codes: set[float]) -> Array:
-        """Where a block ends (3,), in machine coordinates; G53 states them, other blocks work coordinates."""
+        """Return where a block ends (3,), in machine coordinates; G53 states them, other blocks work coordinates."""
         target = self._machine.end.copy()
         for letter, value in axes:
             i = "XYZ".index(letter)
@@ -302,7 +302,7 @@ class Controller:
         return False
 
     def _press(self, pin: str, seconds: float) -> None:
-        """What a person or a machine does at the controller's inputs, whenever the fault says so."""
+        """Return what a person or a machine does at the controller's inputs, whenever the fault says so."""
         match pin:
             case "hard_limit":
                 self._alarm(1)

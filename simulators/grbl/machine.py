@@ -60,7 +60,7 @@ class Machine:
 
     @property
     def travelling(self) -> bool:
-        """Whether an axis turns."""
+        """Return whether an axis turns."""
         return self._speed > 0 or bool(self.blocks) or bool(self._homing)
 
     @property
@@ -70,12 +70,12 @@ class Machine:
 
     @property
     def at_a_switch(self) -> bool:
-        """Whether an axis stands on a limit switch, at either end of its travel."""
+        """Return whether an axis stands on a limit switch, at either end of its travel."""
         return bool(np.any(self._true > 1e-6) or np.any(self._true < -self.per_axis(130) - 1.0))
 
     @property
     def end(self) -> Array:
-        """Where the last planned block ends (3,), in machine coordinates."""
+        """Return where the last planned block ends (3,), in machine coordinates."""
         return self.blocks[-1].target if self.blocks else self.position
 
     def hold(self) -> None:

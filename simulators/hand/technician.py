@@ -79,7 +79,7 @@ def follow(words: str, grip: Grip, above_m: Array, share: float = 1.0) -> Grip:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """What happens during one press of the button."""
+    """Holds what happens during one press of the button."""
 
     shake: tuple[float, float] = (0.0, 0.0)  # image motion during the exposure, as fractions of its width
     finger: bool = False

@@ -28,7 +28,7 @@ class Caster:
         self._scene.run(ray, ray)  # builds the tree, which several threads must not do at once
 
     def blocked(self, origins: Array32, directions: Array32) -> Bools:
-        """Whether each ray (N, 3) hits something within the length of its direction."""
+        """Return whether each ray (N, 3) hits something within the length of its direction."""
         # embreex cannot cast segments: compare the hit distance with the direction's length, which is 1.
         hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
         return (hit["primID"] >= 0) & (hit["tfar"] < 1.0)

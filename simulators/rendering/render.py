@@ -33,7 +33,7 @@ _SUB = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the camera sees: the parsed answer to the world's `view` request."""
+    """Holds what the camera sees: the parsed answer to the world's `view` request."""
 
     T_world_camera: Array
     intrinsics: Intrinsics

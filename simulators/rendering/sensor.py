@@ -57,7 +57,7 @@ def read_out(light: Light, iso: float, seed: int) -> NDArray[np.uint16]:
     Args:
         light: (H, W, 3) RGB of the exposed photosites, linear, 65535 at saturation.
         iso: sensitivity; the higher, the fewer electrons make a value.
-        seed: of the noise.
+        seed: the seed of the noise.
     """
     height, width = light.shape[:2]
     rng = np.random.default_rng([seed, 14])

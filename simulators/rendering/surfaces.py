@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from simulators.geometry import Array, Array32, Bools, Bytes, Ints
-from simulators.rendering.kept import kept
+from simulators.rendering.array_cache import cached
 from simulators.rendering.lighting import Caster, blocked_rays, vertex_light
 from simulators.rendering.noise import Noise
 from simulators.rendering.textures import (
@@ -24,7 +24,7 @@ from simulators.rendering.textures import (
     specimen_texture,
     steel_texture,
 )
-from simulators.scene.parts import Part, grid_faces, joined, sphere_mesh, vertex_normals
+from simulators.scene.parts import Part, grid_faces, join_parts, sphere_mesh, vertex_normals
 from simulators.scene.world import BOARD_THICKNESS_M, RADIUS_M, Scene
 
 MATERIALS = ("specimen", "board", "post", "steel", "drape")
@@ -117,7 +117,7 @@ class Surfaces:
         self._parts = parts
         self._light: dict[bool, Array32] = {}
         painted = (scene.seed, scene.specimen.anatomy, scene.specimen.grid_m, texture_size)
-        *texels, texel_m, self._ripple = kept("textures", painted, lambda: _painted(scene, texture_size))
+        *texels, texel_m, self._ripple = cached("textures", painted, lambda: _painted(scene, texture_size))
         self._textures = [MipMap(Texture(*texture)) for texture in zip(texels, texel_m.tolist(), strict=True)]
 
     def light(self, control: bool) -> Array32:
@@ -126,7 +126,7 @@ class Surfaces:
             scene = self.scene
             spheres = (scene.registration_m, scene.control_m if control else None)
             lit = (self._vertices, self._normals, self._faces, *spheres, scene.lamp_m)
-            (self._light[control],) = kept("light", lit, lambda: [self._lit(control)])
+            (self._light[control],) = cached("light", lit, lambda: [self._lit(control)])
         return self._light[control]
 
     def _lit(self, control: bool) -> Array32:
@@ -141,7 +141,7 @@ class Surfaces:
         return self._blocked_by([*self._parts, *_spheres(self.scene.registration_m)])
 
     def _blocked_by(self, parts: list[Part]) -> Bools:
-        solid = joined("shadow", "any", parts)
+        solid = join_parts("shadow", "any", parts)
         return blocked_rays(Caster(solid.vertices_m, solid.faces), self._vertices, self._normals, self.scene.lamp_m)
 
     def shade(self, eye: Array, directions: Array32, pixel_rad: float, *, control: bool, spray: bool) -> Shaded:

@@ -38,7 +38,7 @@ def as_recorded(body: str) -> tuple[str, ...]:
     return "--recorded", body, "--answers", json.dumps(by_hand)
 
 
-def again(ready: dict[str, Any], taken: int) -> tuple[str, ...]:
+def restart_options(ready: dict[str, Any], taken: int) -> tuple[str, ...]:
     """The words with which a camera that died is found where it was, and counts on."""
     port = str(ready.get("gphoto_port", "")).rpartition(":")[2]
     return (*(("--port", port) if port else ()), "--first-counter", str(taken + 1))

@@ -20,7 +20,7 @@ import yaml
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
-from simulators.rig.cameras import CAMERAS, STILL, again, as_recorded, place, section
+from simulators.rig.cameras import CAMERAS, STILL, as_recorded, place, restart_options, section
 from simulators.rig.deliveries import (
     add_delivery_arguments,
     check_delivery_arguments,
@@ -230,7 +230,7 @@ class _Rig:
         )
 
     def _left_out(self) -> Iterator[str]:
-        """What the simulators that serve a recording answer by themselves."""
+        """Yield what the simulators that serve a recording answer by themselves."""
         for name, ready in self._ready.items():
             yield from (f"{name}, {what}" for what in ready.get("not_served", ()))
 
@@ -284,7 +284,7 @@ class _Rig:
         if name in ("camera", *self.further):
             log = self._exposures_log(name)
             taken = len(log.read_text().splitlines()) if log.exists() else 0
-            words += again(self._ready[name], taken)  # these override the first ones
+            words += restart_options(self._ready[name], taken)  # these override the first ones
         with suppress(SimulatorError):  # it is retried
             self._child(name, *words)
 

@@ -16,7 +16,7 @@ _MOST_ARMS = 2
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What a recording makes of a rig."""
+    """Holds what a recording makes of a rig."""
 
     arm: str  # model of its arms; "" if it holds none
     arms: int

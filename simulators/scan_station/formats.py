@@ -39,11 +39,11 @@ def encode(
 
     Args:
         kind: ply, obj or stl.
-        name: of the mesh file.
+        name: the mesh file's name.
         vertices: (V, 3), in the file's unit.
         faces: (F, 3).
-        normals: of the vertices (V, 3); None if the scanner exports none.
-        artec: as Artec Studio writes it.
+        normals: the vertices' normals (V, 3); None if the scanner exports none.
+        artec: true for a file as Artec Studio writes it.
     """
     stem = name.rsplit(".", 1)[0]
     if kind == "ply" and artec:

@@ -18,7 +18,7 @@ class Scanner:
         missing: coordinate of a pixel that measured nothing.
         normals: whether a view has them.
         colours: whether a view has them.
-        views: of one scan, as people take it with this scanner.
+        views: the number of views of one scan, as people take it with this scanner.
     """
 
     formats: tuple[str, ...]

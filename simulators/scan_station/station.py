@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from simulators.faults import Fault, FaultPlan
 from simulators.geometry import Array, Ints, apply, inverse, transform
-from simulators.rendering.kept import kept
+from simulators.rendering.array_cache import cached
 from simulators.scan_station.formats import encode
 from simulators.scan_station.scanners import SCANNERS, USUAL_SPACING_MM, VIEWS, add_scanner_arguments, chosen_format
 from simulators.scan_station.view_formats import e57, view_ply
 from simulators.scan_station.views import sensor_pose, sensor_view
 from simulators.scene.parts import Part, sphere_mesh, vertex_normals
 from simulators.scene.world import RADIUS_M, Scene, parse_moved
-from simulators.serve import Request, SimulatorError, Termination, announce, told
+from simulators.serve import Request, SimulatorError, Termination, announce, wait_for_line
 from simulators.units import UNITS, in_unit, metres
 
 log = logging.getLogger(__name__)
@@ -123,11 +123,11 @@ def _seen_counts(parts: list[Part]) -> list[tuple[Array, Array]]:
     vertices = np.concatenate([part.vertices_m for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
     normals = np.concatenate([vertex_normals(part.vertices_m, part.faces) for part in parts])
-    count, best = kept("seen", [vertices, faces, normals], lambda: _seen(vertices, faces, normals))
+    count, best = cached("seen", [vertices, faces, normals], lambda: _count_views(vertices, faces, normals))
     return [(count[a:b], best[a:b]) for a, b in pairwise(offsets)]
 
 
-def _seen(vertices: Array, faces: Ints, normals: Array) -> list[Array]:
+def _count_views(vertices: Array, faces: Ints, normals: Array) -> list[Array]:
     """For each vertex (V, 3): the number (V,) of scanner poses that see it, and the best cosine (V,) of incidence."""
     scene = EmbreeScene()
     mesh = TriangleMesh(scene, vertices[faces].astype(np.float32))
@@ -250,7 +250,7 @@ def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> Non
     nth = args.nth or 1 + len(list(folder.glob("scan_*.*")))
     kind = chosen_format(args.scanner, args.format)
     exports = _views(scene, args, kind, nth) if kind in VIEWS else [_mesh(scene, args, kind, nth)]
-    if announce_it and args.when_told and not told():
+    if announce_it and args.when_told and not wait_for_line():
         return
     for export in exports:
         fault = faults.check("scanner", "export")

@@ -25,7 +25,7 @@ class FurtherCamera:
     Attributes:
         place: one of PLACES.
         T_outer_camera: (4, 4) in the world if fixed, otherwise in the first camera's frame.
-        lens: at full resolution.
+        lens: the lens at full resolution.
         clock_ahead_s: how far its clock is ahead of the first camera's.
     """
 
@@ -36,7 +36,7 @@ class FurtherCamera:
 
     @property
     def fixed(self) -> bool:
-        """Whether it stands in the room; otherwise it moves with the first camera."""
+        """Return whether it stands in the room; otherwise it moves with the first camera."""
         return self.place == "fixed"
 
     @classmethod

@@ -20,7 +20,7 @@ class Part:
     uv: Array
 
 
-def joined(name: str, material: str, parts: list[Part]) -> Part:
+def join_parts(name: str, material: str, parts: list[Part]) -> Part:
     """Merge several parts of the same material into one."""
     offsets = np.cumsum([0, *(len(part.vertices_m) for part in parts[:-1])])
     return Part(

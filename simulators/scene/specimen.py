@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from simulators.geometry import Array, Ints, smoothstep
-from simulators.rendering.kept import kept
-from simulators.scene.parts import Part, grid_faces, joined
+from simulators.rendering.array_cache import cached
+from simulators.scene.parts import Part, grid_faces, join_parts
 
 HALF_LENGTH_M = 0.160
 HALF_WIDTH_M = 0.090
@@ -149,7 +149,7 @@ class Specimen:
             lean=float(rng.uniform(-0.02, 0.02)),
         )
         relief = Relief.draw(rng, (n_x, n_y))
-        (grid,) = kept(
+        (grid,) = cached(
             "specimen",
             [anatomy, n_x, n_y, *relief.drawn()],
             lambda: [_with_relief(relief, anatomy, _smooth(anatomy, n_x, n_y))],
@@ -169,7 +169,7 @@ class Specimen:
         a, b, c, d = left[:-1], left[1:], right[1:], right[:-1]
         base = np.concatenate([np.stack([a, c, b], axis=1), np.stack([a, d, c], axis=1)])
         closed = Part(top.name, top.material, top.vertices_m, np.concatenate([top.faces, base]), top.uv)
-        return joined("specimen", "specimen", [closed, *ends])
+        return join_parts("specimen", "specimen", [closed, *ends])
 
     def _end(self, rim: Ints, u: float) -> Part:
         """A cut end as rings from the rim to its centre, because light is stored at vertices."""

@@ -13,7 +13,7 @@ from simulators.geometry import Array, Ints, from_euler
 from simulators.scene.arm import ARM_ERRORS_USUAL, ARM_MODEL, ArmErrorKind, ArmErrors, SimulatedArm, UniversalRobot
 from simulators.scene.intrinsics import FULL_HEIGHT, FULL_WIDTH, Intrinsics
 from simulators.scene.lbr_arm import LBR_MODELS, Lbr, LbrErrors
-from simulators.scene.parts import Part, box, cylinder, joined, sphere_mesh
+from simulators.scene.parts import Part, box, cylinder, join_parts, sphere_mesh
 from simulators.scene.specimen import Specimen
 
 RADIUS_M = 0.015
@@ -153,8 +153,8 @@ class Scene:
         low, high = np.array([-hx, -hy, -BOARD_THICKNESS_M]), np.array([hx, hy, 0.0])
         wood = box(low, high, cell_m=0.0025)
         board = Part("board", "board", wood.vertices_m, wood.faces, wood.uv)
-        posts = joined("posts", "post", [self._post(i) for i in range(len(self.foot_m))])
-        wires = joined("wires", "steel", [cylinder(a, b, 0.001, 12, 10, (0.0, 1.0)) for a, b in self._wires()])
+        posts = join_parts("posts", "post", [self._post(i) for i in range(len(self.foot_m))])
+        wires = join_parts("wires", "steel", [cylinder(a, b, 0.001, 12, 10, (0.0, 1.0)) for a, b in self._wires()])
         return (self.specimen.part(), board, posts, wires)
 
     def parts(self, control_spheres: bool) -> tuple[Part, ...]:

@@ -44,7 +44,7 @@ _LADDERS = {Code.F_NUMBER: F_NUMBERS, Code.SHUTTER_SPEED: SHUTTERS, Code.ISO: IS
 
 @dataclass(frozen=True, slots=True)
 class SonyOptions:
-    """What is peculiar to a Sony: its lens, its start, and how it tells of a file."""
+    """Holds what is peculiar to a Sony: its lens, its start, and how it tells of a file."""
 
     lens: str = "AF"  # the switch on the lens, AF or MF; "" without a lens
     not_ready_s: float = 0.0  # after a session was opened, releases give no photograph for so long
@@ -89,7 +89,7 @@ class SonyBody(CameraBody):
 
     @property
     def controls(self) -> tuple[int, ...]:
-        """What can be pressed or stepped."""
+        """Return what can be pressed or stepped."""
         return tuple({*self.table.controls, *CONTROLS, *(_LADDERS if self.table.protocol < _DIRECT else ())})
 
     def session_opened(self) -> None:

@@ -142,7 +142,7 @@ class CameraProperty:
 
 @dataclass(frozen=True, slots=True)
 class BodyTable:
-    """What a body states about itself after power-on."""
+    """Holds what a body states about itself after power-on."""
 
     model: str
     firmware: str
@@ -254,7 +254,7 @@ class PropertyTable:
         )
 
     def _files(self) -> tuple[bool, bool]:
-        """Whether an exposure gives a JPEG, and whether a raw file."""
+        """Return whether an exposure gives a JPEG, and whether a raw file."""
         if kind := self.value(Code.FILE_FORMAT):
             return kind != FILE_RAW, kind != FILE_JPEG
         compression = self.value(Code.COMPRESSION)

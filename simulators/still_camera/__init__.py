@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def image_source(args: argparse.Namespace) -> ImageSource:
-    """Where the pictures come from."""
+    """Return where the pictures come from."""
     if args.world:
         return WorldSource(args.world, args.image_width or DEFAULT_WIDTH, camera=args.camera)
     if args.image:

@@ -92,7 +92,7 @@ class CameraBody(ABC):
 
     @property
     def exposing(self) -> bool:
-        """Whether an exposure is in progress."""
+        """Return whether an exposure is in progress."""
         return self._exposing.is_set()
 
     @abstractmethod
@@ -108,10 +108,10 @@ class CameraBody(ABC):
         """Put finished files where the client fetches them, and announce them."""
 
     def begun(self) -> None:  # noqa: B027 - most cameras do not announce it
-        """What the camera says when an exposure begins."""
+        """Return what the camera says when an exposure begins."""
 
     def done(self) -> None:  # noqa: B027 - most cameras do not announce it
-        """What the camera says when an exposure has ended, with or without a file."""
+        """Return what the camera says when an exposure has ended, with or without a file."""
 
     def press(self, iso: int = 0) -> None:
         """Press the camera's own button, perhaps after the ISO dial was turned; ignored while busy or full."""

@@ -41,7 +41,7 @@ class ExposureSettings:
 
 @dataclass(frozen=True, slots=True)
 class Nameplate:
-    """What a body writes about itself into its files."""
+    """Holds what a body writes about itself into its files."""
 
     make: str
     model: str

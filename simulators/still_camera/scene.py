@@ -35,7 +35,7 @@ class NotReadyError(SimulatorError):
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What was in front of the lens when the shutter opened; develop() may take longer."""
+    """Holds what was in front of the lens when the shutter opened; develop() may take longer."""
 
     counter: int
     T_world_camera: list[list[float]] | None

@@ -123,7 +123,7 @@ class Controller:
 
     @property
     def busy(self) -> bool:
-        """Whether anything but the clock changes from cycle to cycle, or will at a planned time."""
+        """Return whether anything but the clock changes from cycle to cycle, or will at a planned time."""
         changing = any(v is not None for v in (self.motion, self._ring, self._pending_fault, self._hand))
         return changing or self._start_up.under_way or self._button_released_s < math.inf
 
@@ -188,7 +188,7 @@ class Controller:
 
     @property
     def may_move(self) -> bool:
-        """Whether the brakes are released and no stop is active."""
+        """Return whether the brakes are released and no stop is active."""
         return self.robot_mode is RobotMode.RUNNING and self.safety in FREE
 
     @property
@@ -260,7 +260,7 @@ class Controller:
         return True
 
     def within_limits(self, q: Array) -> bool:
-        """Whether all joints are within ±360°."""
+        """Return whether all joints are within ±360°."""
         return bool(np.all(np.isfinite(q)) and np.max(np.abs(q)) <= kinematics.JOINT_LIMIT_RAD + 1e-9)
 
     def joints_ago(self, cycles: int) -> Array:

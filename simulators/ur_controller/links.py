@@ -139,12 +139,12 @@ class RtdeLink(Link):
 
     @property
     def only_receives(self) -> bool:
-        """Whether the client has set up outputs but no inputs."""
+        """Return whether the client has set up outputs but no inputs."""
         return self._output is not None and not self._inputs
 
     @property
     def streaming(self) -> bool:
-        """Whether the client wants data packages and reads them."""
+        """Return whether the client wants data packages and reads them."""
         return self._streaming and not self.dead and len(self.out) < MAX_BACKLOG_BYTES
 
     @property

@@ -81,7 +81,7 @@ class StartUp:
 
     @property
     def under_way(self) -> bool:
-        """Whether the mode will change by itself."""
+        """Return whether the mode will change by itself."""
         return self._goal is not None
 
     def begin(self, mode: RobotMode, goal: RobotMode, now_s: float) -> RobotMode:

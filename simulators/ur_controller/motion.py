@@ -215,7 +215,7 @@ class Hand:
 
     @property
     def done(self) -> bool:
-        """Whether the hand has let go."""
+        """Return whether the hand has let go."""
         return self._left_s <= 0.0
 
 

@@ -61,7 +61,7 @@ class Recorded:
 
     @property
     def not_served(self) -> tuple[str, ...]:
-        """What the recording holds and the simulator answers by itself, and what it does not hold."""
+        """Return what the recording holds and the simulator answers by itself, and what it does not hold."""
         own = [
             f"dashboard, {question}: {answer}"
             for question, answer in self.answers.items()

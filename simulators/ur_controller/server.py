@@ -90,7 +90,7 @@ class Server:
         return (registers.ints[int(index)],) if kind == "int" else (registers.doubles[int(index)],)
 
     def faulty(self, link: Link, message: str) -> bool:
-        """Whether the fault plan spoils this message: by a dropped link, silence or a refusal."""
+        """Return whether the fault plan spoils this message: by a dropped link, silence or a refusal."""
         fault = self.controller.faults.check(self.controller.device, message)
         if fault is None:
             return False

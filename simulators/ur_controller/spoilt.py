@@ -14,7 +14,7 @@ _MOST = {"UINT8": 0xFF, "UINT32": 0xFFFFFFFF, "UINT64": (1 << 64) - 1}  # signed
 
 
 class SpoiltFields:
-    """What one client gets instead of the fields that it asked for."""
+    """Holds what one client gets instead of the fields that it asked for."""
 
     def __init__(self, plan: FaultPlan, device: str) -> None:
         self._faults = {
@@ -26,11 +26,11 @@ class SpoiltFields:
         self._frozen: dict[str, tuple[float, ...]] = {}
 
     def __bool__(self) -> bool:
-        """Whether the plan spoils any field."""
+        """Return whether the plan spoils any field."""
         return bool(self._faults)
 
     def absent(self, name: str) -> bool:
-        """Whether the controller does not know this field."""
+        """Return whether the controller does not know this field."""
         return name in self._faults and self._faults[name].kind == "absent"
 
     def next_package(self) -> None:
@@ -38,7 +38,7 @@ class SpoiltFields:
         self._packages += 1
 
     def value(self, name: str, kind: str, value: tuple[float, ...]) -> tuple[float, ...]:
-        """What the client gets for a field of this RTDE type."""
+        """Return what the client gets for a field of this RTDE type."""
         fault = self._faults.get(name)
         if fault is None or not self._due(fault):
             return value

@@ -12,10 +12,13 @@ from typer.testing import CliRunner
 
 from service.audit.overview.devices import clock_offsets
 from service.cli.main import app
+from service.core.gates.measure_names import measure_name
 from service.core.records.events import FilesKept, SessionStarted, StepStarted
 from service.core.text.clock_time import local_time
+from service.steps import step_kinds
 from service.store.records import NewArtefact
 from service.store.store import Store
+from service.web.page.run_words import sentence
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
@@ -69,11 +72,20 @@ def test_all_gates_have_a_page(web: tuple[WebSite, str]) -> None:
     site, run_id = web
     page = read(web, "/gates")
     log = site.site.run(run_id)
-    gates = [(step.title, gate) for step in log.protocol.steps for gate in step.gates]
+    gates = [gate for step in log.protocol.steps for gate in step.gates]
     assert gates
     assert page.count("Within") + page.count("Outside") + page.count("Not yet") >= len(gates)
-    for title, _ in gates:
-        assert title in page
+    declared = {name: kind.measures.declared() for name, kind in step_kinds().items()}
+    explained = 0
+    for step in log.protocol.steps:
+        assert not step.gates or step.title in page
+        for gate in step.gates:
+            assert measure_name(gate.measure) in page
+            measure = declared[step.kind].get(gate.measure)
+            if measure is not None and not gate.why:
+                assert sentence(measure.meaning) in page, "a limit without a reason says what its measure means"
+                explained += 1
+    assert explained
 
 
 def test_a_verification_in_the_terminal_is_known_to_the_page(web: tuple[WebSite, str]) -> None:

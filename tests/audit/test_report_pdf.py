@@ -130,7 +130,7 @@ def test_a_sign_that_no_font_has_loses_the_standard_and_not_the_report(tmp_path:
     assert "/StructTreeRoot" in root_of(pdf)
     assert reader.xmp_metadata is not None
     assert b"pdfuaid:part" not in reader.xmp_metadata.stream.get_data()
-    assert "Begun by Ada" in " ".join(reader.pages[0].extract_text().split())
+    assert "Started by Ada" in " ".join(reader.pages[0].extract_text().split())
 
 
 def test_a_hash_is_copied_whole(report: Report, pdf: bytes) -> None:

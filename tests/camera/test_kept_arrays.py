@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulators.rendering import kept as module
-from simulators.rendering.kept import VARIABLE, kept
+from simulators.rendering import array_cache as module
+from simulators.rendering.array_cache import VARIABLE, cached
 from simulators.rendering.render import Renderer
 from simulators.rig.world_server import World
 from simulators.scene.specimen import Specimen
@@ -76,7 +76,7 @@ def test_nothing_is_kept_unless_the_environment_says_where(tmp_path: Path, monke
     monkeypatch.chdir(tmp_path)
     compute = Computing()
     for _ in range(2):
-        kept("things", [1], compute)
+        cached("things", [1], compute)
     assert compute.times == 2
     assert not list(tmp_path.iterdir())
 
@@ -84,8 +84,8 @@ def test_nothing_is_kept_unless_the_environment_says_where(tmp_path: Path, monke
 def test_what_is_kept_is_the_same_and_is_found_by_all_its_inputs(folder: Path) -> None:
     compute = Computing()
     inputs = (1, 0.1, np.array([1.0, 2.0]), None)
-    first = kept("things", inputs, compute)
-    assert same(kept("things", inputs, compute), first)
+    first = cached("things", inputs, compute)
+    assert same(cached("things", inputs, compute), first)
     assert compute.times == 1
     others = [
         ("thing", inputs),
@@ -96,14 +96,14 @@ def test_what_is_kept_is_the_same_and_is_found_by_all_its_inputs(folder: Path) -
         ("things", inputs[:3]),
     ]
     for times, (what, given) in enumerate(others, start=2):
-        kept(what, given, compute)
+        cached(what, given, compute)
         assert compute.times == times, given
 
 
 @pytest.mark.parametrize("damage", ["half", "byte", "empty", "other"])
 def test_a_damaged_entry_is_computed_again(folder: Path, damage: str) -> None:
     compute = Computing()
-    first = kept("things", [1], compute)
+    first = cached("things", [1], compute)
     (path,) = folder.iterdir()
     data = path.read_bytes()
     at = data.index(np.arange(6, dtype=np.float32).tobytes())
@@ -114,8 +114,8 @@ def test_a_damaged_entry_is_computed_again(folder: Path, damage: str) -> None:
         "other": b"no archive",
     }
     path.write_bytes(spoilt[damage])
-    assert same(kept("things", [1], compute), first)
-    assert same(kept("things", [1], compute), first)
+    assert same(cached("things", [1], compute), first)
+    assert same(cached("things", [1], compute), first)
     assert compute.times == 2
 
 
@@ -123,7 +123,7 @@ def test_a_folder_that_cannot_be_is_done_without(tmp_path: Path, monkeypatch: py
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv(VARIABLE, str(tmp_path / "file"))
     compute = Computing()
-    assert same(kept("things", [1], compute), kept("things", [1], compute))
+    assert same(cached("things", [1], compute), cached("things", [1], compute))
     assert compute.times == 2
 
 
@@ -135,13 +135,13 @@ def test_the_least_recently_used_entries_go_and_too_large_ones_are_not_kept(
 
     monkeypatch.setattr(module, "MOST_BYTES", 50_000)
     monkeypatch.setattr(module, "MOST_ENTRY_BYTES", 15_000)
-    kept("large", [0], lambda: of(15_001))
+    cached("large", [0], lambda: of(15_001))
     assert not folder.exists()
     folder.mkdir()
     (folder / "things-left.123-4.part").write_bytes(bytes(10_000))
     for number in range(6):
-        kept(f"n{number}", [number], lambda: of(10_000))
-        kept("n0", [0], lambda: of(10_000))  # used each time
+        cached(f"n{number}", [number], lambda: of(10_000))
+        cached("n0", [0], lambda: of(10_000))  # used each time
     assert {path.name.partition("-")[0] for path in folder.iterdir()} == {"n0", "n3", "n4", "n5"}
 
 
@@ -149,7 +149,7 @@ def test_many_at_once_find_whole_entries_only(folder: Path) -> None:
     large = [np.random.default_rng(3).random(200_000)]
 
     def use(number: int) -> bool:
-        return same(kept("large", [number % 3], lambda: large), large)
+        return same(cached("large", [number % 3], lambda: large), large)
 
     with ThreadPoolExecutor(8) as pool:
         assert all(pool.map(use, range(60)))

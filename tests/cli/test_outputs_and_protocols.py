@@ -134,7 +134,7 @@ def test_every_command_takes_the_name_of_a_shipped_protocol(
     done = CliRunner().invoke(app, [word.format("demoo") for word in words], env={"COLUMNS": "300"})
     assert done.exit_code == 1
     assert "no protocol of this name comes with orthocapture" in done.output
-    assert "exvivo_spine.yaml" in done.output
+    assert "exvivo_spine, handheld_spine" in done.output
 
 
 def test_the_check_outside_a_checkout_names_the_file_that_it_read(

@@ -37,7 +37,7 @@ def capturing(text: str = TOY) -> Log:
 def test_a_step_says_how_long_it_usually_takes_here_and_until_when() -> None:
     log = capturing()
     words = work_words(log.protocol, log.state, {"capture": TEN}, NOW, hhmm)
-    assert words == "Usually 10 min (3 earlier runs on this site); begun at 00:00, so until about 00:10."
+    assert words == "Usually 10 min (3 earlier runs on this site); started at 00:00, so until about 00:10."
 
 
 def test_the_protocols_estimate_is_said_before_the_first_run() -> None:
@@ -49,7 +49,7 @@ def test_the_protocols_estimate_is_said_before_the_first_run() -> None:
 def test_what_is_not_known_is_not_guessed() -> None:
     log = capturing()
     words = work_words(log.protocol, log.state, {}, NOW, hhmm)
-    assert words == "Begun at 00:00; how long it takes is not known yet on this site."
+    assert words == "Started at 00:00; how long it takes is not known yet on this site."
     assert away_words(log.protocol, log.state, {}, NOW, hhmm) == ""
 
 
@@ -148,6 +148,6 @@ def test_a_pause_is_not_work() -> None:
     log.late_s = 1800.0
     log.act("resume")
     words = work_words(log.protocol, log.state, {"capture": TEN}, later(34), hhmm)
-    assert words == "Usually 10 min (3 earlier runs on this site); begun at 00:00, so until about 00:40."
+    assert words == "Usually 10 min (3 earlier runs on this site); started at 00:00, so until about 00:40."
     words = work_words(log.protocol, log.state, {"capture": TEN}, later(47), hhmm)
     assert "It has worked for 17 min, and longer than ever before" in words

@@ -27,6 +27,10 @@ def test_every_measure_has_a_name_for_people_and_a_meaning_and_no_name_is_left_o
         REGISTRATION_MEASURE_NAMES
     )
     assert [name for name, meaning in measures.items() if not meaning] == []
+    # A page shows one of them alone, so that it names no other measure and refers to none before it.
+    assert [
+        meaning for meaning in measures.values() if "`" in meaning or meaning.startswith(("the same", "that "))
+    ] == []
 
 
 def test_no_two_measures_have_the_same_name_and_none_repeats_its_unit() -> None:

@@ -63,14 +63,14 @@ def test_without_a_table_of_mounts_the_probe_decides(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("answer", "words"),
+    ("answer", "refusal"),
     [
         (OSError(errno.ENOLCK, "No locks available"), r"without working locks \(No locks available\)"),
         (None, "whose locks do not exclude anybody"),
     ],
 )
 def test_a_file_system_whose_locks_fail_or_exclude_nobody_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: OSError | None, words: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: OSError | None, refusal: str
 ) -> None:
     def lock(_descriptor: int, _command: int, _argument: Any = 0) -> int:
         if answer is not None:
@@ -78,7 +78,7 @@ def test_a_file_system_whose_locks_fail_or_exclude_nobody_is_refused(
         return 0
 
     monkeypatch.setattr(fcntl, "fcntl", lock)
-    with pytest.raises(StoreError, match=words):
+    with pytest.raises(StoreError, match=refusal):
         mounts.require_own_mount(tmp_path)
 
 

@@ -7,6 +7,8 @@ import re
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from docs.generate.pages import REFERENCE, pages
 from docs.generate.rooms import layers, pages_with_rooms, rooms_table
 from docs.generate.steps import measures_of_kind
@@ -40,6 +42,7 @@ def test_every_page_is_reached_from_the_first() -> None:
     assert pages_there == {page for page in listed if not page.startswith("decisions/")}
 
 
+@pytest.mark.slow
 def test_the_generated_documents_are_up_to_date() -> None:
     """`make reference` regenerates them."""
     for name, text in pages().items():

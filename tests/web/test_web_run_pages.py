@@ -298,7 +298,7 @@ def test_the_step_says_how_long_it_takes_on_this_site(web: WebSite) -> None:
     tell(web, run_id, doing="working", robot="standing")
     page = browser.get(f"/runs/{run_id}").text
     assert re.search(
-        r"Usually \d+ s \(one earlier run on this site\); begun at \d\d:\d\d:\d\d UTC, so until about", page
+        r"Usually \d+ s \(one earlier run on this site\); started at \d\d:\d\d:\d\d UTC, so until about", page
     )
 
 

@@ -67,7 +67,7 @@ class Mutation:
 
     @property
     def name(self) -> str:
-        """Where it is."""
+        """Return where it is."""
         return f"{self.place.file}:{self.line}"
 
 
@@ -227,7 +227,7 @@ def _named(node: cst.CSTNode, names: Iterable[str]) -> bool:
 
 
 def _without_effect(node: cst.CSTNode) -> bool:  # noqa: PLR0911 - one rule a return
-    """Whether no result depends on a node and what is in it (the rules at the top)."""
+    """Return whether no result depends on a node and what is in it (the rules at the top)."""
     match node:
         case cst.Annotation() | cst.Import() | cst.ImportFrom() | cst.Raise() | cst.Decorator():
             return True

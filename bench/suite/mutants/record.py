@@ -19,7 +19,7 @@ from bench.suite.mutants.trial import copied_tree
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What tests cost, and which reach each function of each file."""
+    """Holds what tests cost, and which reach each function of each file."""
 
     costs: dict[str, float]
     reached: dict[str, dict[str, list[str]]]

@@ -31,7 +31,7 @@ def cpu_s() -> float:
 
 
 class Span(NamedTuple):
-    """Where a function stands in its file; decorators are its first lines."""
+    """Says where a function stands in its file; decorators are its first lines."""
 
     first: int
     body: int

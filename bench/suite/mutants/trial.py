@@ -43,7 +43,7 @@ Outcome = Literal["killed", "survived", "hung", "untested", "broken"]
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of a mutation."""
+    """Holds what became of a mutation."""
 
     mutation: Mutation
     outcome: Outcome

@@ -166,7 +166,7 @@ def content_of(data: Path) -> Content | str:
 
 
 def same_rows(one: Content, other: Content | str) -> bool:
-    """Whether both have the same rows.
+    """Return whether both have the same rows.
 
     Their order within a table does not matter: where order counts, a column has it.
     """
@@ -195,7 +195,7 @@ def columns_of(data: Path) -> dict[str, tuple[str, ...]]:
 
 
 def differences(before: Content, now: Content | str, columns: Mapping[str, tuple[str, ...]]) -> set[str]:
-    """Where the content differs: `table.column`, `table +row`, `table -row`, or a number of the database."""
+    """Return where the content differs: `table.column`, `table +row`, `table -row`, or a number of the database."""
     if isinstance(now, str):
         return {"unreadable"}
     places: set[str] = set()

@@ -242,7 +242,7 @@ class _Run:
 
 
 def _is(what: str, process: psutil.Process, rig: str) -> bool:
-    """Whether a process is of the kind to be killed. Raises psutil.Error if it has ended meanwhile."""
+    """Return whether a process is of the kind to be killed. Raises psutil.Error if it has ended meanwhile."""
     words = " ".join(process.cmdline())
     simulators = {"simulated robot": " ur ", "simulated camera": " camera ", "simulated light box": " lightbox "}
     if what in simulators:

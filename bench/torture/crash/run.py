@@ -133,7 +133,7 @@ class Place:
         return self.folder / "elsewhere.jsonl"
 
     def second_place(self, store: Store) -> SecondPlace:
-        """Where that copy is kept."""
+        """Return where that copy is kept."""
         return SecondPlace.of(self.data, self.signature_copy, store.clock, store.files)
 
     @property

@@ -292,7 +292,7 @@ def _killed_in_between(trial: Trial) -> None:
 
 
 def _send_again(trial: Trial) -> None:
-    """What a person does at the CT suite, once the receiver can be reached."""
+    """Return what a person does at the CT suite, once the receiver can be reached."""
     if trial.case.spoil is not None and trial.case.spoil.column.startswith("away_"):
         trial.await_return()
     _suite(trial).send_again()

@@ -52,7 +52,7 @@ _MOST_DECISIONS = 40  # of the person, after whom the run counts as going round 
 
 @dataclass(frozen=True, slots=True)
 class Pressure:
-    """What is withheld from a run, and whether its drivers are killed."""
+    """Holds what is withheld from a run, and whether its drivers are killed."""
 
     words: str
     everything: Limits = field(default_factory=Limits)  # the rig's simulators among it
@@ -207,7 +207,7 @@ class Person:
 
 
 def _asked(data: Path) -> str:
-    """What a person has to do now: confirm, sign, or nothing."""
+    """Return what a person has to do now: confirm, sign, or nothing."""
     with Store.open(data, create=False) as store:
         run_id = store.find_run("latest")
         if run_id not in store.driven_runs():
@@ -220,7 +220,7 @@ def _asked(data: Path) -> str:
 
 
 def _memory_short(data: Path) -> bool:
-    """Whether what failed last needs more memory than this machine has."""
+    """Return whether what failed last needs more memory than this machine has."""
     with Store.open(data, create=False) as store:
         events = store.events(store.find_run("latest"))
     failed = [event.payload for event in events if isinstance(event.payload, StepFailed)]

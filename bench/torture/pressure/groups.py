@@ -16,7 +16,7 @@ _PERIOD_US = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a group of processes may use; None: as much as there is."""
+    """Holds what a group of processes may use; None: as much as there is."""
 
     processors: float | None = None
     memory_mb: int | None = None

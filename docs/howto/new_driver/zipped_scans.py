@@ -37,7 +37,7 @@ class ZippedScans:
         """Do nothing: nothing is kept open."""
 
     def report(self) -> DeviceReport:
-        """What `orthocapture doctor` and the record of a run say of the device."""
+        """Return what `orthocapture doctor` and the record of a run say of the device."""
         archives = self._archives()
         cut_off = tuple(f"{one.name}: still being written, or damaged" for one in archives if not _is_whole(one))
         return DeviceReport(self._identity(), details={"archives": str(len(archives))}, problems=cut_off)

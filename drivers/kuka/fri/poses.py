@@ -100,7 +100,7 @@ class FriPoses:
         }
 
     def problems(self) -> list[str]:
-        """What is wrong with FRI; each says what to do."""
+        """Return what is wrong with FRI; each says what to do."""
         last = self._last
         if last is not None and last.session is Session.IDLE:
             return [

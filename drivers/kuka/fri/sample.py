@@ -23,7 +23,7 @@ class FriSample:
         is_normal: whether the safety controller reports no stop.
         session: state of the session.
         quality: how punctual the controller finds the replies.
-        period_ms: between two messages, as the controller has it.
+        period_ms: the controller's time between two messages.
         received: messages so far.
         lost: messages so far that never came.
         refused: datagrams so far that were not messages of this controller.

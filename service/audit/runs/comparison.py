@@ -109,8 +109,8 @@ def _about(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty
         pair = [str(getattr(about, field)) for about in said]
         if any(pair):
             yield _row(name, *pair)
-    yield _row("Begun (UTC)", *(run.events[0].at_utc[:19].replace("T", " ") for run in (first, second)))
-    yield _row("Begun by", first.root.operator, second.root.operator)
+    yield _row("Started (UTC)", *(run.events[0].at_utc[:19].replace("T", " ") for run in (first, second)))
+    yield _row("Started by", first.root.operator, second.root.operator)
     yield _row("Protocol", *(f"{run.protocol.id} {run.protocol.version}" for run in (first, second)))
     yield _row("State", first.state.status, second.state.status)
     yield _row("Rig", *("simulated" if run.root.simulated else "real" for run in (first, second)))

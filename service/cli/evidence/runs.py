@@ -56,7 +56,7 @@ def runs_command(
         console.print("No run matches." if wanted.active else "No run has been recorded here yet.")
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("run", "begun (UTC)", "specimen", "purpose", "protocol", "by", "result"):
+    for heading in ("run", "started (UTC)", "specimen", "purpose", "protocol", "by", "result"):
         table.add_column(heading)
     for run in found:
         cells = (run.about.specimen, run.about.purpose, f"{run.protocol} {run.version}", by(run), result_words(run))

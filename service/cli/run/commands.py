@@ -30,7 +30,7 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.import_operator import ImportOperator
 from service.cli.run.terminal.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.run.terminal.waiting import wait_for_results
-from service.cli.shipped_protocols import protocol_file
+from service.cli.shipped_protocols import PROTOCOL_HELP, protocol_file
 from service.core.errors import ConfigurationError, PersonNeededError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.entered import about_run
@@ -75,9 +75,7 @@ WorkerOption = Annotated[
 
 
 def run_command(
-    protocol: Annotated[
-        Path, typer.Argument(help="The protocol file, or the name of a shipped one, such as exvivo_spine.")
-    ],
+    protocol: Annotated[Path, typer.Argument(help=PROTOCOL_HELP)],
     rig: RigOption,
     data: DataOption = DEFAULT_DATA,
     operator: OperatorOption = "",

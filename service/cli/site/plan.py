@@ -20,7 +20,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.status import next_best_views
-from service.cli.shipped_protocols import protocol_file
+from service.cli.shipped_protocols import PROTOCOL_HELP, protocol_file
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import Step, load_protocol
 from service.core.run.fold import fold
@@ -38,7 +38,7 @@ plan_app = typer.Typer(no_args_is_help=True, help="Plan viewpoints, before and d
 
 @plan_app.command("show")
 def show_command(
-    protocol: Annotated[Path, typer.Argument(help="The protocol file.")],
+    protocol: Annotated[Path, typer.Argument(help=PROTOCOL_HELP)],
     rig: Annotated[Path, typer.Option("--rig", help="The rig file; `collision: {arm: …}` names the arm.")],
     step: Annotated[str | None, typer.Option("--step", help="Only this capture step.")] = None,
     json: JsonOption = False,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from service.cli.common import JsonOption, console, print_document, print_json, reporting_errors
-from service.cli.shipped_protocols import protocol_file
+from service.cli.shipped_protocols import PROTOCOL_HELP, protocol_file
 from service.core.documents.protocol_docs import lifecycle_text, schema_text
 from service.core.documents.ways_docs import ways_text
 from service.core.protocol.models import load_protocol
@@ -23,7 +23,7 @@ protocol_app = typer.Typer(name="protocol", help="Check a protocol file before i
 
 @protocol_app.command("check")
 def check_command(
-    file: Annotated[Path, typer.Argument(help="The protocol file.")],
+    file: Annotated[Path, typer.Argument(help=PROTOCOL_HELP)],
     rig: Annotated[
         Path | None, typer.Option("--rig", help="Also check that this rig has its stations and devices.")
     ] = None,
@@ -58,14 +58,14 @@ def schema_command() -> None:
 
 
 @protocol_app.command("diagram")
-def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
+def diagram_command(file: Annotated[Path, typer.Argument(help=PROTOCOL_HELP)]) -> None:
     """Print the state machine of a protocol as a page with Mermaid diagrams."""
     with reporting_errors():
         print_document(lifecycle_text(load_protocol(protocol_file(file), params_models()).protocol))
 
 
 @protocol_app.command("ways")
-def ways_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
+def ways_command(file: Annotated[Path, typer.Argument(help=PROTOCOL_HELP)]) -> None:
     """Print the ways on after every failure of a protocol's steps, with time and loss, as a page of tables."""
     with reporting_errors():
         print_document(ways_text(load_protocol(protocol_file(file), params_models()).protocol))

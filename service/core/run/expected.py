@@ -52,9 +52,9 @@ def work_words(
         return ""
     usual = usual_time(protocol, state, step, earlier)
     if usual is None:
-        return f"Begun at {clock(now.work_began_utc)}; how long it takes is not known yet on this site."
+        return f"Started at {clock(now.work_began_utc)}; how long it takes is not known yet on this site."
     took_s = now.work_s(now_utc)
-    said = f"Usually {duration(usual.seconds)} ({usual.source}); begun at {clock(now.work_began_utc)}"
+    said = f"Usually {duration(usual.seconds)} ({usual.source}); started at {clock(now.work_began_utc)}"
     if took_s > max(_TOO_LONG * usual.seconds, usual.longest_s):
         longest = duration(usual.longest_s)
         most = "" if usual.longest_s == usual.seconds else f", and longer than ever before ({longest})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, Response
@@ -10,11 +10,14 @@ from fastapi.responses import HTMLResponse, Response
 from service.audit.background.incremental import Progress
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest
-from service.core.protocol.models import Protocol
-from service.core.run.state import RunState
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import RunState, StepState
 from service.dataset.registrations import evaluated, own_registration
+from service.steps import step_kinds
+from service.steps.protocol_check import measures_of
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
+from service.web.page.run_words import sentence
 from service.web.run.figures import GateLine, gate_lines
 from service.web.security.guards import requires
 
@@ -77,8 +80,19 @@ def gates_of(digest: Digest) -> list[StepGates]:
             continue
         now = state.steps[step.id]
         failed = sum(gate.step == step.id and gate.attempt < now.attempt for gate in digest.failed_gates)
-        out.append(StepGates(step.id, step.title, now.attempt, gate_lines(step, now, state.skipped), failed))
+        lines = _explained(protocol, step, now, state.skipped)
+        out.append(StepGates(step.id, step.title, now.attempt, lines, failed))
     return out
+
+
+def _explained(protocol: Protocol, step: Step, now: StepState, skipped: frozenset[str]) -> tuple[GateLine, ...]:
+    """Return the gates of a step; where the protocol gives no reason for a limit, what its measure means."""
+    kind = step_kinds().get(step.kind)
+    measures = {} if kind is None else kind.measures.declared()
+    measures |= measures_of(step, {known.id: known for known in protocol.steps}) or {}
+    meanings = {name: sentence(measure.meaning) for name, measure in measures.items() if measure.meaning}
+    lines = zip(step.gates, gate_lines(step, now, skipped), strict=True)
+    return tuple(replace(line, why=line.why or meanings.get(gate.measure, "")) for gate, line in lines)
 
 
 def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:

@@ -40,7 +40,7 @@ def broken(
 
 
 def tells(message: str) -> bool:
-    """Whether a message names a place and a remedy."""
+    """Return whether a message names a place and a remedy."""
     return _SAYS.match(message) is not None
 
 

@@ -72,7 +72,7 @@ class Suite:
 
     @property
     def log(self) -> Path:
-        """What the receiver wrote to its standard error."""
+        """Return what the receiver wrote to its standard error."""
         return self._trial.folder / "received.log"
 
     def kill_receiver(self) -> None:

@@ -370,7 +370,7 @@ class RunningProxy:
             self.control.sendall(b"a")
 
     def deeds(self) -> list[dict[str, Any]]:
-        """What the proxy has done so far, oldest first."""
+        """Return what the proxy has done so far, oldest first."""
         if not self.journal.exists():
             return []
         return [json.loads(line) for line in self.journal.read_text().splitlines()]

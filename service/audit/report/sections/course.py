@@ -174,7 +174,7 @@ def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, S
         f"attempt {state.attempt}" if state.attempt > 1 else "",
     ]
     if state.started_utc:
-        parts.append(f"begun {clock(state.started_utc)}")
+        parts.append(f"started {clock(state.started_utc)}")
     if state.started_utc and state.ended_utc:
         parts.append(f"took {duration(state.started_utc, state.ended_utc)}")
     parts.append(shots[state.step].words if state.step in shots else "")

@@ -26,7 +26,7 @@ def facts(run: RecordedRun) -> DescriptionList:
         (
             *_of_what_and_where(run),
             ("Run", run.run_id),
-            ("Begun", utc(events[0].at_utc)),
+            ("Started", utc(events[0].at_utc)),
             ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
             (
                 "State",
@@ -35,7 +35,7 @@ def facts(run: RecordedRun) -> DescriptionList:
                     "ok" if status == "completed" else "attention",
                 ),
             ),
-            ("Begun by", run.named(root.operator)),
+            ("Started by", run.named(root.operator)),
             ("Others who took part", ", ".join(others) or "none"),
             ("Released by", run.named(state.released_by) if state.released_by else "nobody"),
             ("Protocol", f"{root.protocol_id}, version {root.protocol_version}"),

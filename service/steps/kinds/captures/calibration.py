@@ -82,11 +82,15 @@ class Measures(CaptureMeasures):
     tilt_deg: Annotated[float | None, Measure("°", 0, 90), "largest tilt of the board against the image plane"] = None
     uncertainty_px: Annotated[Px, "standard deviation of a projected point, worst in the image"] = None
     uncertainty_mm: Annotated[
-        float | None, Measure("mm", 1e-4, 10), "`uncertainty_px` as a length at the distance of the board"
+        float | None,
+        Measure("mm", 1e-4, 10),
+        "uncertainty of a projected point as a length at the distance of the board",
     ] = None
-    uncertainty_centre_mm: Annotated[float | None, Measure("mm", 1e-4, 10), "the same in the centre of the image"] = (
-        None
-    )
+    uncertainty_centre_mm: Annotated[
+        float | None,
+        Measure("mm", 1e-4, 10),
+        "uncertainty of a point projected to the centre of the image, as a length at the board",
+    ] = None
     board_bow_mm: Annotated[float | None, Measure("mm", 0, 5), "the larger of the board's two bows"] = None
     hand_eye_sigma_mm: Annotated[
         float | None, Measure("mm", 1e-4, 20), "standard deviation of the camera's position on the flange"
@@ -101,7 +105,9 @@ class Measures(CaptureMeasures):
         float | None, Measure("°", 1e-4, 10), "median rotation error of views held out of the hand-eye calibration"
     ] = None
     hand_eye_uncorrected_held_out_mm: Annotated[
-        float | None, Measure("mm", 1e-3, 50), "`hand_eye_held_out_mm` without the correction of the arm"
+        float | None,
+        Measure("mm", 1e-3, 50),
+        "median position error of held-out views without the correction of the arm",
     ] = None
     hand_eye_arm_corrected: Annotated[
         Share, "1 if a correction of the arm was found that reduces the errors, else 0"

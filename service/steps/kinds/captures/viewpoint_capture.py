@@ -52,7 +52,7 @@ class Measures(PredictedMeasures, CaptureMeasures):
     ] = None
     live_images: Annotated[Count, "images that the prediction takes into account"] = None
     outline_limited_error_mm: Annotated[
-        ErrorMm, "`predicted_target_error_mm` if the camera poses were exact: only the outlines limit it"
+        ErrorMm, "predicted error at the specimen if the camera poses were exact: only the outlines limit it"
     ] = None
 
 

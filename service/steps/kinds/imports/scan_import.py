@@ -73,7 +73,9 @@ class Measures(SphereMeasures):
     part_residual_rms_mm: Annotated[
         ErrorMm, "rms distance of a shared sphere in a part from its mean over the parts, after merging"
     ] = None
-    part_residual_max_mm: Annotated[ErrorMm, "largest distance of that kind"] = None
+    part_residual_max_mm: Annotated[
+        ErrorMm, "largest distance of a shared sphere in a part from its mean over the parts, after merging"
+    ] = None
     faces: Annotated[Count, "faces of the mesh that is used"] = None
     since_application_min: Annotated[
         float | None, Measure("min", 0.1, 1e4), "time from the application of the coat to the arrival of the scan"

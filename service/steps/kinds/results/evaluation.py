@@ -57,9 +57,9 @@ class EvaluatedRegistration(MeasureRecord):
 class Measures(RegistrationMeasures[EvaluatedRegistration]):
     """The errors of every registration, and of the best one."""
 
-    best_mean_radial_error_mm: Annotated[ErrorMm, "`NAME_mean_radial_error_mm` of the registration that is used"] = (
-        None
-    )
+    best_mean_radial_error_mm: Annotated[
+        ErrorMm, "mean radial error over the control spheres, of the registration that is used"
+    ] = None
     best_predicted_error_mm: Annotated[ErrorMm, "predicted error of the registration that is used"] = None
     control_normalised_chi2: Annotated[
         Ratio, "radial errors against their predicted standard deviations: near 1 if those are right"

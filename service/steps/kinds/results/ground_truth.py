@@ -81,10 +81,14 @@ class Measures(MeasureRecord):
     loop_closure_mm: Annotated[
         ErrorMm, "largest displacement of a sphere around the loop from scan to CT by spheres and back by cameras"
     ] = None
-    loop_closure_rms_mm: Annotated[ErrorMm, "rms displacement of the spheres around that loop"] = None
-    loop_closure_deg: Annotated[Deg, "rotation around that loop"] = None
+    loop_closure_rms_mm: Annotated[
+        ErrorMm, "rms displacement of the spheres around the loop from scan to CT and back"
+    ] = None
+    loop_closure_deg: Annotated[Deg, "rotation around the loop from scan to CT by spheres and back by cameras"] = None
     chamfer_ct_scan_mm: Annotated[ErrorMm, "Chamfer distance of CT and scan as the paper defines it"] = None
-    chamfer_floor_mm: Annotated[ErrorMm, "what that would be between equal surfaces, by the sampling alone"] = None
+    chamfer_floor_mm: Annotated[ErrorMm, "Chamfer distance that equal surfaces would have, by the sampling alone"] = (
+        None
+    )
     ct_to_scan_mm: Annotated[ErrorMm, "mean distance from the CT to the scan"] = None
     scan_to_ct_mm: Annotated[ErrorMm, "mean distance from the scan to the CT, with what only the scan shows"] = None
     ct_to_scan_median_mm: Annotated[ErrorMm, "median distance from the CT to the scan"] = None
@@ -92,7 +96,7 @@ class Measures(MeasureRecord):
     ct_above_scan_mm: Annotated[
         float | None, Measure("mm", -20, 20), "median height of the CT above the scan where both are good"
     ] = None
-    ct_spread_mm: Annotated[ErrorMm, "robust standard deviation of that height"] = None
+    ct_spread_mm: Annotated[ErrorMm, "robust standard deviation of the height of the CT above the scan"] = None
     ct_share: Annotated[Share, "share of the vertices that come from the CT"] = None
     scan_share: Annotated[Share, "share of the vertices that come from the scan"] = None
     blend_share: Annotated[Share, "share of the vertices between the two"] = None

@@ -132,7 +132,11 @@ class Measures(RegistrationMeasures[OneRegistration]):
     further_consistency_mm: Annotated[
         ErrorMm, "rms distance between the poses of a further camera by single images and by all, for the worst one"
     ] = None
-    further_consistency_mrad: Annotated[float | None, Measure("mrad", 1e-3, 100), "the same for the rotation"] = None
+    further_consistency_mrad: Annotated[
+        float | None,
+        Measure("mrad", 1e-3, 100),
+        "rms angle between the poses of a further camera by single images and by all, for the worst one",
+    ] = None
 
 
 class Result(Record):

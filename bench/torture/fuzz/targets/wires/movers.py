@@ -39,7 +39,7 @@ _MOUNT = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.6), (0.0
 
 
 def _use(arm: RobotArm, joints: Sequence[float]) -> None:
-    """What a capture does with an arm; its records are those of the evidence."""
+    """Return what a capture does with an arm; its records are those of the evidence."""
     try:
         canonical(dataclasses.asdict(arm.open()))
         report = arm.report()
@@ -67,7 +67,7 @@ def _kuka_controller() -> KukaController:
 
 
 def _kuka_lines(_: Path) -> list[bytes]:
-    """What a controller says in a session, with numbers of requests as the driver counts them."""
+    """Return what a controller says in a session, with numbers of requests as the driver counts them."""
     state = {**_kuka_controller().state(1), "locked": False}
     hello = {"is": "hello", "protocol": 1, "model": "LBR Med 14", "serial": "1", "software": "x", "time_s": 1.0}
     permitted, stopped = ({"is": "ack", "seq": sequence} for sequence in (1, 3))
@@ -119,7 +119,7 @@ class _Turns(Termination):
         self._left = turns
 
     def is_set(self) -> bool:
-        """Whether the turns are used up."""
+        """Return whether the turns are used up."""
         self._left -= 1
         return self._left < 0
 
@@ -143,7 +143,7 @@ def _kuka_simulator(data: bytes, _: Path) -> None:
 
 
 def _grbl_session() -> dict[bytes, bytes]:
-    """What the simulated controller answers to each line of the driver, in a fixed order."""
+    """Return what the simulated controller answers to each line of the driver, in a fixed order."""
     said: list[bytes] = []
     controller = GrblController(Machine({24: 1e6, 25: 1e6}, 1e3), said.append, FaultPlan())
     controller.power_up()

@@ -32,7 +32,7 @@ _SUFFIX = ".npz"
 Arrays = Sequence[NDArray[Any]]
 
 
-def kept(what: str, inputs: Sequence[object], compute: Callable[[], Arrays]) -> Arrays:
+def cached(what: str, inputs: Sequence[object], compute: Callable[[], Arrays]) -> Arrays:
     """Return what `compute()` returns, or has returned for the same inputs before; the arrays are the same bits.
 
     Args:
