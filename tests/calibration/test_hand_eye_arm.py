@@ -161,7 +161,7 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
 
 
 def test_the_start_keeps_the_one_view_that_was_turned_far_though_it_fits_worst() -> None:
-    """Before, it was left out with the worst quarter of nine, and the others gave the board a negative size."""
+    """It once was left out with the worst quarter of nine, and the others gave the board a negative size."""
     scene = Scene.generate(127, arm_errors="both")
     session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=1280)
     found = robust_start(session.T_base_flange, session.T_camera_board, np.random.default_rng(0))

@@ -92,7 +92,7 @@ def test_a_way_from_elsewhere_is_not_begun_but_planned_anew_from_where_the_arm_s
 def test_a_viewpoint_that_is_taken_again_is_planned_from_where_the_arm_stands(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before, the arm went back to it by a way that nobody had checked."""
+    """The arm once went back to it by a way that nobody had checked."""
     bench = begin(PROTOCOL)
     planned: list[list[str]] = []
     here: list[Array] = []

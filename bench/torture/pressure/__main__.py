@@ -224,7 +224,7 @@ def _memory_short(data: Path) -> bool:
     with Store.open(data, create=False) as store:
         events = store.events(store.find_run("latest"))
     failed = [event.payload for event in events if isinstance(event.payload, StepFailed)]
-    return bool(failed) and any(words in failed[-1].message for words in ("and this machine has", "MB are free"))
+    return bool(failed) and any(text in failed[-1].message for text in ("and this machine has", "MB are free"))
 
 
 def _drive(words: Sequence[str], log: Any, groups: Sequence[Group], person: Person) -> int:
