@@ -61,7 +61,7 @@ def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, brow
         assert in_sight(page, "#robot-banner .robot-banner")
         record(server, run_id, skip("fixation"))
         title = page.get_by_role("heading", name="Capture", level=1)
-        expect(title).to_be_focused(timeout=20_000)
+        expect(title).to_be_focused()
         assert scrolled(page) == 0
         assert in_sight(page, "#robot-banner .robot-banner")
         assert in_sight(page, ".step-head h1")
@@ -71,7 +71,7 @@ def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, brow
         failed = StepFailed(step="capture", attempt=1, error="DeviceError", message="no link", recovery="ask")
         go = OperatorAction(action="confirm", step="capture")
         record(server, run_id, go, StepStarted(step="capture", attempt=1), failed)
-        expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible(timeout=20_000)
+        expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible()
         expect(title).to_be_focused()
         assert scrolled(page) == 0
 
@@ -111,7 +111,7 @@ def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) 
         page.add_init_script(f"({HEARD})()")
         tablet.go(f"/runs/{run_id}")
         record(server, run_id, skip("fixation"))
-        expect(page.get_by_role("heading", name="Capture", level=1)).to_be_visible(timeout=20_000)
+        expect(page.get_by_role("heading", name="Capture", level=1)).to_be_visible()
         expect(page).to_have_title(re.compile("^Waits: Capture: your confirmation is awaited"))
         assert page.evaluate("heard") == []
         choice = page.get_by_role("button", name="Alerts")
@@ -123,7 +123,7 @@ def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) 
         failed = StepFailed(step="capture", attempt=1, error="DeviceError", message="no link", recovery="ask")
         go = OperatorAction(action="confirm", step="capture")
         record(server, run_id, go, StepStarted(step="capture", attempt=1), failed)
-        expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible(timeout=20_000)
+        expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible()
         page.wait_for_function("heard.length > 0")  # the page is followed after it has changed
         assert page.evaluate("heard") == [880, 440, 880, 440]
         assert page.evaluate("noted") == [["Stopped: Capture: No link → check the device.", f"Run {run_id}"]]
@@ -175,7 +175,7 @@ def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browse
         figure, marks = panel.locator("[data-live-figure]"), panel.locator("[data-live-marks]")
         frames.append(sharp)
         panel.get_by_role("button", name="Start live view").click()
-        expect(figure).to_have_text("100 %", timeout=20_000)
+        expect(figure).to_have_text("100 %")
         found = int(marks.get_attribute("data-found") or 0)
         assert found > 10_000, "edges are marked"
         red = page.evaluate(
@@ -187,17 +187,15 @@ def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browse
         )
         assert red > 0.8 * found  # the magnifier's frame covers some
         frames.append(cv2.GaussianBlur(sharp, (0, 0), 6))
-        expect(figure).to_have_text(re.compile(r"^[123]?\d %"), timeout=20_000)
+        expect(figure).to_have_text(re.compile(r"^[123]?\d %"))
         assert int(marks.get_attribute("data-found") or 0) < 0.5 * found
         frames.append(sharp)
-        expect(figure).to_have_text(re.compile(r"^(9[5-9]|100) %"), timeout=20_000)
+        expect(figure).to_have_text(re.compile(r"^(9[5-9]|100) %"))
         panel.get_by_role("button", name="Mark sharp edges").click()
         expect(marks).to_have_attribute("data-found", "0")
         # The magnifier shows the touched area, in pixels of the frame.
         frames.append(np.where(np.arange(1024) < 512, 30, 220).astype(np.uint8)[None].repeat(680, 0))
-        expect(panel.locator("[data-live-light]")).to_contain_text(
-            "Mean 125 of 255; 0.0 % at the white end", timeout=20_000
-        )
+        expect(panel.locator("[data-live-light]")).to_contain_text("Mean 125 of 255; 0.0 % at the white end")
         stage = box(panel.locator("[data-live-stage]"))
         for share, light in ((0.2, 30), (0.8, 220)):
             page.mouse.click(stage["x"] + share * stage["width"], stage["y"] + 0.5 * stage["height"])
@@ -207,11 +205,11 @@ def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browse
             }"""
             assert page.evaluate(middle)[0] == pytest.approx(light, abs=3)
         frames.append(np.full((680, 1024), 255, np.uint8))
-        expect(panel.locator("[data-live-light]")).to_contain_text("100.0 % at the white end", timeout=20_000)
+        expect(panel.locator("[data-live-light]")).to_contain_text("100.0 % at the white end")
         # The event belongs to this step.
         step = OperatorAction(action="skip", step="camera_set_up", reason="focused the day before")
         record(server, run_id, step)
-        expect(panel).to_be_hidden(timeout=20_000)
+        expect(panel).to_be_hidden()
 
 
 FURTHER = (
@@ -260,13 +258,13 @@ def test_the_live_view_changes_to_the_camera_that_is_pressed(server: Served, bro
         panel = page.get_by_role("region", name="Live view")
         light, choice = panel.locator("[data-live-light]"), panel.get_by_role("group", name="Camera of the live view")
         panel.get_by_role("button", name="Start live view").click()
-        expect(light).to_contain_text("Mean 60 of 255", timeout=20_000)
+        expect(light).to_contain_text("Mean 60 of 255")
         for name in ("side", "top", ""):
             button = choice.get_by_role("button", name=name or "First camera")
             button.click()
             expect(button).to_have_attribute("aria-pressed", "true")
             expect(choice.locator("[aria-pressed=true]")).to_have_count(1)
-            expect(light).to_contain_text(f"Mean {LIGHTS[name]} of 255", timeout=20_000)
+            expect(light).to_contain_text(f"Mean {LIGHTS[name]} of 255")
             expect(panel.get_by_role("status")).to_have_text("Live")
 
 
@@ -280,11 +278,11 @@ def test_a_frame_of_the_camera_that_was_left_is_not_shown_as_the_other_ones(serv
         page = tablet.page
         panel = page.get_by_role("region", name="Live view")
         panel.get_by_role("button", name="Start live view").click()
-        expect(panel.get_by_role("status")).to_have_text("Live", timeout=20_000)
+        expect(panel.get_by_role("status")).to_have_text("Live")
         page.evaluate(SLOW_FIRST_CAMERA)
         page.evaluate("asked")
         panel.get_by_role("button", name="top", exact=True).click()  # it sends no frames
         expect(panel.locator("[data-live-light]")).to_have_text("")
         page.evaluate("held.forEach((go) => go())")
-        expect(panel.get_by_role("status")).to_have_text(re.compile("^No frame yet"), timeout=20_000)
+        expect(panel.get_by_role("status")).to_have_text(re.compile("^No frame yet"))
         assert page.evaluate("shown") == []
