@@ -44,20 +44,20 @@
   };
   const types = (e) => e.matches?.("textarea, select, [contenteditable], input:not([type=checkbox], [type=radio], [type=button])");
   let waiting = 0;
+  let keyAt = -Infinity; // by the events' own times: a busy page runs its timers late
   let prefixAt = -Infinity;
   document.addEventListener("keydown", (event) => {
-    const alone = !waiting;
+    const alone = event.timeStamp - keyAt > ALONE_MS;
+    keyAt = event.timeStamp;
     clearTimeout(waiting);
-    waiting = 0;
     if (!isOn() || event.ctrlKey || event.metaKey || event.altKey || event.repeat || event.defaultPrevented) return;
     if (types(event.target) || document.querySelector("dialog:modal")) return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : "";
     const to = performance.now() - prefixAt < PREFIX_MS;
     const act = to ? PLACES[key] : ACTS[key];
     prefixAt = -Infinity;
-    if (!alone || !(act || key === "g")) { waiting = setTimeout(() => { waiting = 0; }, ALONE_MS); return; }
+    if (!alone || !(act || key === "g")) return;
     waiting = setTimeout(() => {
-      waiting = 0;
       if (act) act();
       else prefixAt = performance.now();
     }, ALONE_MS);
