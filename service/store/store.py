@@ -32,6 +32,7 @@ from service.store.errors import UnknownRunError
 from service.store.events import append, read_events, to_event
 from service.store.files.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
 from service.store.logged_events import tell
+from service.store.mounts import require_own_mount
 from service.store.queue import jobs as queue
 from service.store.queue.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
@@ -98,6 +99,7 @@ class Store:
                 remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
             )
         folder = open_folder(data_dir, files, ids)
+        require_own_mount(data_dir)
         close_to_others(data_dir, DATABASE_NAME)
         database = open_database(data_dir, files, patience_s)
         log = SignatureLog(data_dir, files, patience_s)

@@ -159,6 +159,14 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
     assert np.all((np.array(record.observed) >= 0) & (corrected.correction.observed <= 1))
 
 
+def test_the_start_keeps_the_one_view_that_was_turned_far_though_it_fits_worst() -> None:
+    """Before, it was left out with the worst quarter of nine, and the others gave the board a negative size."""
+    scene = Scene.generate(127, arm_errors="both")
+    session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=1280)
+    found = robust_start(session.T_base_flange, session.T_camera_board, np.random.default_rng(0))
+    assert found.scale == pytest.approx(1.0, abs=0.05)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ARM_ERRORS)
 def test_an_arm_is_corrected_whether_its_calibration_is_lost_or_its_gears_err(

@@ -197,7 +197,7 @@ def test_a_mend_comes_first_and_costs_its_views() -> None:
     assert [way.verb for way in ways_on(log.protocol, log.state)][-2:] == ["abort", "accept"]
     accept = ways_on(log.protocol, log.state)[-1]
     assert not accept.available
-    assert "allows nobody to accept views" in accept.why_not
+    assert "allows nobody to accept Board images used" in accept.why_not
 
 
 def test_a_step_whose_requirement_cannot_be_done_again_may_be_left_out() -> None:

@@ -341,7 +341,12 @@ def test_a_redo_says_what_it_resets() -> None:
 
 @pytest.mark.parametrize(
     ("measure", "words"),
-    [("rms_px", "RMS"), ("five_fold_rms_px", "Five fold RMS"), ("tilt_deg", "Tilt"), ("views", "Views")],
+    [
+        ("rms_px", "RMS reprojection error"),
+        ("five_fold_rms_px", "RMS reprojection error in cross-validation"),
+        ("tilt_deg", "Largest tilt of the board"),
+        ("views", "Board images used"),
+    ],
 )
 def test_measures_have_names_for_people(measure: str, words: str) -> None:
     assert measure_name(measure) == words

@@ -45,7 +45,7 @@ OWN_TESTS: dict[str, tuple[str, ...]] = {
     "signatures": ("tests/verify",),
     "verifier": ("tests/store", "tests/verify"),
     "cost": ("tests/registration",),
-    "covariances": ("tests/registration", "tests/poses", "tests/calibration", "tests/further", "tests/core"),
+    "covariances": ("tests/registration", "tests/poses", "tests/calibration", "tests/second_camera", "tests/core"),
     "exporters": ("tests/dataset",),
     "fusion": ("tests/ground_truth", "tests/scanner"),
     "watchdogs": ("tests/robot", "tests/steps"),

@@ -39,6 +39,7 @@ from service.steps import params_models
 from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.files.space_used import forecast_of
+from service.store.mounts import why_unsafe
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
@@ -75,15 +76,16 @@ def doctor_command(
             record_devices(station, record, SystemClock(), quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
         free_bytes = shutil.disk_usage(existing).free
+        unsafe = why_unsafe(existing)
         place = _second_place(rig_file, data)
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
-    healthy = healthy and (space is None or space.verdict == "enough") and not place.get("problem")
+    healthy = healthy and not unsafe and (space is None or space.verdict == "enough") and not place.get("problem")
     clock = host_clock()
     missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
     if json:
         devices = {name: _record(report) for name, report in found.items()}
-        folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes}
+        folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes, "unsafe": unsafe or None}
         if space is not None:
             folder["forecast"] = dataclasses.asdict(space) | {"verdict": space.verdict, "words": space.words}
         found_clock = clock.model_dump()
@@ -103,6 +105,8 @@ def doctor_command(
         for name, report in found.items():
             _print(name, report)
         _print_machine(data, free_bytes, space, clock)
+        if unsafe:
+            console.tell(("!", "bold red"), f" the data folder is {unsafe} (docs/howto/operating.md, One server)")
         if place:
             console.print(
                 f"second place of the signatures {place['path']}: {place['problem'] or 'up to date'}", markup=False

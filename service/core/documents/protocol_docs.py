@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Gate, Protocol, Step, protocol_json_schema
 from service.core.protocol.step_params import StepParams
@@ -100,7 +101,7 @@ def _mermaid(lines: Iterable[str]) -> list[str]:
 
 def _gates(gates: tuple[Gate, ...]) -> str:
     return "; ".join(
-        f"{gate.measure} {limits(gate.min, gate.max)} {gate.unit}".rstrip()
+        f"{measure_name(gate.measure)} {limits(gate.min, gate.max)} {gate.unit}".rstrip()
         + (f" (unless {gate.unless_skipped} is skipped)" if gate.unless_skipped else "")
         + (f" (or accepted by {gate.accept_by.replace('_', ' ')})" if gate.accept_by else "")
         for gate in gates

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
 
+from service.core.gates.measure_names import measure_name
 from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import GateVerdict
 from service.core.recovery.policy import recovery_policy
@@ -81,7 +82,7 @@ def _failures(protocol: Protocol, step: Step) -> Iterator[tuple[str, RunState]]:
     for name, gates in kinds.items():
         if gates:
             verdicts = tuple(_failed(gate) for gate in gates[:1])
-            yield f"{name}, such as {gates[0].measure}", change(at, step.id, verdicts=verdicts)
+            yield f"{name}, such as “{measure_name(gates[0].measure)}”", change(at, step.id, verdicts=verdicts)
     again = step.repeated
     device = "UnreadableFileError" if step.kind.endswith("_import") else "DeviceFaultError"
     errors = ((device, "a device fails", again.device), ("ComputeError", "a computation fails", again.computes))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from service.core.errors import IllegalTransitionError
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import describe_judged
 from service.core.protocol.models import AcceptedBy, Protocol
 from service.core.records.events import GateVerdict, OperatorAction
@@ -44,14 +45,14 @@ def acceptance_refusal(protocol: Protocol, state: RunState) -> IllegalTransition
     if now.retry_granted:
         return IllegalTransitionError("the step is about to be tried again", where=step.id, remedy="Wait for it")
     by = {gate.measure: gate.accept_by for gate in step.gates}
-    forbidden = [verdict.measure for verdict in failed if by.get(verdict.measure) is None]
+    forbidden = [measure_name(verdict.measure) for verdict in failed if by.get(verdict.measure) is None]
     if forbidden:
         return IllegalTransitionError(
             f"the protocol allows nobody to accept {', '.join(forbidden)} outside the limits",
             where=step.id,
             remedy="Mend it, do the step again, or end the run here",
         )
-    unmeasured = [verdict.measure for verdict in failed if verdict.value is None]
+    unmeasured = [measure_name(verdict.measure) for verdict in failed if verdict.value is None]
     if unmeasured:
         return IllegalTransitionError(
             f"{', '.join(unmeasured)} was not measured: there is nothing to judge",

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from service.core.errors import ComputeError, ConfigurationError
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import limits as gate_text
 from service.core.jobs.keys import key_stem
 from service.core.jobs.priorities import LIVE
@@ -200,7 +201,8 @@ class LiveAnalysis:
         last = suggestions[-1]
         names = ", ".join(view.viewpoint for view in suggestions)
         short = "; ".join(
-            f"{gate.measure} is {measures[gate.measure]:.3g} {gate.unit}, needed {gate_text(gate.min, gate.max)}"
+            f"{measure_name(gate.measure)} is {measures[gate.measure]:.3g} {gate.unit}, "
+            f"needed {gate_text(gate.min, gate.max)}"
             for gate in failed
             if gate.measure in measures
         )

@@ -11,6 +11,7 @@ from service.audit.background.incremental import Progress
 from service.audit.overview import findings, first_page
 from service.audit.overview.corrections import correct
 from service.audit.record import artefact_queries, event_rows, run_rows
+from service.core.gates.measure_names import measure_name
 from service.web.audit.frame import CurrentAudit, audit_frame, link
 from service.web.page.rendering import render
 from service.web.run.forms import Reason
@@ -55,6 +56,7 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
         pictures=pictures,
         page=page,
         pages=pages,
+        measure_name=measure_name,
         href=lambda number: link(f"{frame.base}/corrections", {"page": number}),
     )
 

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, Response
 
 from service.core.errors import IllegalTransitionError
 from service.core.gates.dependence import AcceptedGate, depends_on
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.records.events import Event, ViewpointCaptured
 from service.run_record import RunRecord
@@ -28,7 +29,7 @@ from service.web.calibration.view import (
 from service.web.page.charts import DotPlot
 from service.web.page.rendering import render
 from service.web.page.run_frame import RunFrame, run_frame
-from service.web.page.run_words import gate_word, limit, measure_name
+from service.web.page.run_words import gate_word, limit
 from service.web.record.images import further_cameras_of
 from service.web.record.recorded_rig import recorded_rig_section
 from service.web.security.guards import requires

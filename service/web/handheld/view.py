@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from service.core.equipment.recorded_devices import recorded_report
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import DeviceOpened, ViewHeld
@@ -20,7 +21,7 @@ from service.jobs.records import Matrix
 from service.jobs.surfaces import coverage_points
 from service.run_record import RunRecord
 from service.steps.handheld.guide import failure_words
-from service.web.page.run_words import limit, measure_name
+from service.web.page.run_words import limit
 from service.web.record.images import captures_of
 
 SIZE = 480.0  # of the drawing, which is square

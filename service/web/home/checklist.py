@@ -8,13 +8,14 @@ from fastapi import APIRouter, Depends, Path, Request
 from fastapi.responses import HTMLResponse
 
 from service.core.errors import ConfigurationError
+from service.core.gates.measure_names import measure_name
 from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import RunStarted
 from service.steps import params_models
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
-from service.web.page.run_words import limit, measure_name
+from service.web.page.run_words import limit
 from service.web.security.guards import requires
 from service.web.site import CurrentSite
 

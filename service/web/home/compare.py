@@ -9,6 +9,7 @@ from fastapi.responses import HTMLResponse
 
 from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
 from service.audit.runs.search import RunSearch, find_runs
+from service.core.gates.measure_names import measure_name
 from service.web.page.rendering import render
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
@@ -26,7 +27,15 @@ def compare_page(
     comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]
     missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
-    return render(request, "home/compare.html.j2", c=comparison, chosen=chosen, offered=offered, missing=missing)
+    return render(
+        request,
+        "home/compare.html.j2",
+        c=comparison,
+        chosen=chosen,
+        offered=offered,
+        missing=missing,
+        measure_name=measure_name,
+    )
 
 
 def _run(site: Site, run_id: str) -> ComparedRun:

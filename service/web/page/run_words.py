@@ -1,7 +1,8 @@
-"""The words of the run page: what a confirmation does, what a step shows, names of measured numbers."""
+"""The words of the run page: what a confirmation does, what a step shows, limits of measured numbers."""
 
 from __future__ import annotations
 
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing, figure, standing
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import GateVerdict
@@ -12,9 +13,6 @@ from service.core.run.state import RunState, StepState
 from service.steps import step_kinds
 from service.steps.context import ROBOT_MOVES, Announcement, BeforeStep
 
-_ACRONYMS = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "five": "Five", "px": "px"}
-_UNITS = frozenset({"px", "mm", "deg", "min", "m", "s", "rad"})
-
 
 def drawing_of(step: Step) -> str:
     """Name of the drawing that shows the step, "" for none: the protocol's own choice, else that of its kind."""
@@ -22,17 +20,10 @@ def drawing_of(step: Step) -> str:
     return step.drawing or (kind.drawing if kind is not None else "")
 
 
-def measure_name(measure: str) -> str:
-    """`five_fold_rms_px` → `Five fold RMS`: the unit stands beside the number."""
-    parts = measure.split("_")
-    while len(parts) > 1 and parts[-1] in _UNITS:
-        parts.pop()
-    words = " ".join(_ACRONYMS.get(part, part) for part in parts)
-    return words[:1].upper() + words[1:]
-
-
 def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
-    """`at least 0.2 and at most 1 mm`."""
+    """Return the limits in words: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
+    if minimum is not None and minimum == maximum:
+        return f"exactly {minimum:g} {unit}".rstrip()
     low = "" if minimum is None else f"at least {minimum:g}"
     high = "" if maximum is None else f"at most {maximum:g}"
     return f"{' and '.join(text for text in (low, high) if text) or 'no limit'} {unit}".rstrip()

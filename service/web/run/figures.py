@@ -9,13 +9,14 @@ from statistics import median
 
 from service.core.equipment.clocks import ClockReading
 from service.core.equipment.disk_space import Forecast, size_words
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import Event, GateVerdict, OperatorAction, RecordedView, SessionStarted
 from service.core.run.expected import duration
 from service.core.run.state import RunState, StepState
 from service.monitor.snapshot import Snapshot
-from service.web.page.run_words import gate_word, limit, measure_name, planned_views
+from service.web.page.run_words import gate_word, limit, planned_views
 
 _GIB = 2.0**30
 _BAR_LIMIT = 75.0  # where along a bar its limit stands, in %
