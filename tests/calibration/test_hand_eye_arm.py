@@ -21,6 +21,7 @@ from service.compute.board.board import Board
 from service.compute.board.next_poses import draw_board_plan, suggest_board_poses
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.compute.hand_eye.reprojection import BoardCorners
+from service.compute.hand_eye.setup import robust_start
 from service.compute.poses.pose_files import write_poses_csv
 from service.compute.poses.robot_files import read_joints_csv
 from service.core.arms.known import arm_model
