@@ -28,7 +28,7 @@ from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 
 if TYPE_CHECKING:
-    from service.steps.poses.time_left import PendingResult
+    from service.steps.due_jobs import PendingResult
 
 
 def recorded_root(store: Store, run_id: str) -> RunStarted:
@@ -122,7 +122,7 @@ def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
 
 def results_to_come(log: RunRecord) -> list[PendingResult]:
     """The planned registrations that have not arrived yet, with the time left; empty if all have."""
-    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - most job kinds
+    from service.steps.due_jobs import missing_results  # noqa: PLC0415 - most job kinds
 
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1

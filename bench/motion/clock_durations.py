@@ -31,8 +31,8 @@ from service.monitor.snapshot import (
     read_snapshot,
     write_frame,
 )
-from service.steps.capture.held_camera import new_images
 from service.steps.context import StepContext
+from service.steps.held_camera import new_images
 from service.store.database.tables import jobs, leases
 from service.store.durable_effects import moment_of
 from service.store.files.leftovers import USUAL_AGE_S, remove_leftovers

@@ -20,7 +20,7 @@ from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_nam
 from service.rig import Rig, RigDevice, RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
-from service.steps.poses.sources import WantedRegistrations, needing_mount
+from service.steps.registration_sources import WantedRegistrations, needing_mount
 
 # Section and field of the file → its credible range, and its unit.
 _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {

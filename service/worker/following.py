@@ -13,7 +13,7 @@ from service.core.records.events import Event
 from service.core.results.arrival import late_s
 from service.core.run.fold import advance
 from service.run_record import RunFollower, recorded_protocol, recorded_root
-from service.steps.poses.due_jobs import due
+from service.steps.due_jobs import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

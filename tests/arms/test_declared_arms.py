@@ -30,11 +30,11 @@ from service.core.seven_axes import elbow_angle_rad
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.plan.planning import ArmAtStation, usual_posture
-from service.steps.capture.plan.preview import preview_plans
-from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds.captures import viewpoint_capture
+from service.steps.kinds import viewpoint_capture
+from service.steps.plan_preview import preview_plans
+from service.steps.planning import ArmAtStation, usual_posture
+from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 from simulators.scene.world import Scene
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"

@@ -31,7 +31,7 @@ from service.core.run.decide import AskOperator
 from service.dataset.posed.exporter import exporters
 from service.jobs.words import term
 from service.steps import params_models
-from service.steps.capture.live_numbers import seen_words
+from service.steps.live_numbers import seen_words
 from tests.support.processes.forked import Forked
 
 ROOT = Path(__file__).parents[2]

@@ -22,7 +22,7 @@ EDGES = {
     "service/core/records/base.py": "writes a record into an event",
     "service/import_folder.py": "the camera of an event, as a photograph states it",
     "service/jobs/kind.py": "reads and writes the arguments and answers of jobs",
-    "service/steps/capture/exposure.py": "the camera of an event, as a photograph states it",
+    "service/steps/exposure.py": "the camera of an event, as a photograph states it",
     "service/worker/following.py": "arguments of a job with references resolved, before its kind reads them",
     "service/worker/job.py": "writes an answer into an event",
     # rows of SQL, and their hashes

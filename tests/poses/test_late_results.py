@@ -47,8 +47,8 @@ from service.rig import load_rig
 from service.run_record import RunRecord, read_log
 from service.run_start import start_run
 from service.steps import params_models
-from service.steps.poses.sources import PLANNED
-from service.steps.poses.time_left import missing_results
+from service.steps.due_jobs import missing_results
+from service.steps.registration_sources import PLANNED
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

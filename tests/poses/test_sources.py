@@ -22,10 +22,9 @@ from service.dataset.summary import RunSummary
 from service.run_record import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
-from service.steps.poses.due_jobs import due
-from service.steps.poses.registration_jobs import recorded_registration_jobs
-from service.steps.poses.sources import PLANNED, decisive
-from service.steps.poses.time_left import missing_results
+from service.steps.due_jobs import due, missing_results
+from service.steps.registration_jobs import recorded_registration_jobs
+from service.steps.registration_sources import PLANNED, decisive
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -29,8 +29,8 @@ from service.core.text.clock_time import time_utc
 from service.jobs.capture import live_summary, live_view
 from service.run_record import open_jobs, read_log, results_to_come
 from service.run_start import recorded_run
-from service.steps.capture.live_numbers import describe_view
 from service.steps.coats import coats
+from service.steps.live_numbers import describe_view
 from service.store.durable_effects import moment_of
 from service.store.store import Store
 

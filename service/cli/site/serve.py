@@ -217,7 +217,7 @@ def _served_already(path: Path, said: bytes) -> ConfigurationError:
 def _load_the_rest() -> None:
     """Load what pages need to be shown but not to be listed: a server is ready earlier, and no page waits for it."""
     list(params_models())
-    for late in ("service.steps.poses.time_left", "service.store.signatures.timestamps"):
+    for late in ("service.steps.due_jobs", "service.store.signatures.timestamps"):
         importlib.import_module(late)
 
 

@@ -30,7 +30,7 @@ from service.web.page.rendering import TEMPLATES, render
 from service.web.security.guards import requires
 
 if TYPE_CHECKING:
-    from service.steps.poses.time_left import PendingResult
+    from service.steps.due_jobs import PendingResult
 
 
 @asynccontextmanager

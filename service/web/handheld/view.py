@@ -20,7 +20,7 @@ from service.jobs.looks import image_of
 from service.jobs.records import Matrix
 from service.jobs.surfaces import coverage_points
 from service.run_record import RunRecord
-from service.steps.handheld.guide import failure_words
+from service.steps.handheld import failure_words
 from service.web.page.run_words import limit
 from service.web.record.images import captures_of
 
