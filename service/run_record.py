@@ -11,13 +11,12 @@ from threading import Lock
 from typing import TYPE_CHECKING, Literal
 
 from service.core.errors import ComputeError, IntegrityError
-from service.core.jobs.keys import arguments_name, job_key
-from service.core.jobs.priorities import lane_of
+from service.core.jobs import arguments_name, job_key
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import ArtefactRef, Event, Payload, RecordedView, RunStarted
 from service.core.run.decide import advance, fold
-from service.core.run.state import JobState, RunState
-from service.core.text.clock_time import time_here
+from service.core.run.state import JobState, RunState, lane_of
+from service.core.text.words import time_here
 from service.jobs.memory_grants import waiting_for_memory
 from service.jobs.words import term
 from service.steps import params_models

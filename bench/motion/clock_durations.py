@@ -15,8 +15,8 @@ from sqlalchemy import update
 
 from bench.motion.clock_world import Duration, Seen, World, above, allows, below
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
+from service.core.records.base import elapsed
 from service.core.records.events import OperatorAction, SessionStarted
-from service.core.records.moments import elapsed
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.figures import read_health

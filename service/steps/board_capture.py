@@ -16,7 +16,7 @@ from service.core.errors import ComputeError
 from service.core.gates.verdict import describe, evaluate_gates
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import GateVerdict
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.jobs.records import Camera
 from service.steps.board_looks import BoardLooks, SearchedBoardImage
 from service.steps.board_plan import (

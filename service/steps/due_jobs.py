@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from service.core.jobs.keys import job_key, newest_job
-from service.core.jobs.priorities import LATER, WAITED
-from service.core.jobs.references import Jobs, Reference, jobs_of
+from service.core.jobs import Jobs, Reference, job_key, jobs_of, newest_job
 from service.core.protocol.models import Protocol, Step
-from service.core.run.state import RunState
+from service.core.run.state import LATER, WAITED, RunState
 from service.jobs.kind import JobRecord, read_part
 from service.jobs.poses import features, hybrid, match, structure_from_motion
 from service.jobs.records import Camera, ImageFile

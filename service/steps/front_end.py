@@ -15,12 +15,10 @@ import numpy as np
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
-from service.core.jobs.keys import job_key
-from service.core.jobs.priorities import EARLY
-from service.core.jobs.references import Jobs
+from service.core.jobs import Jobs, job_key
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import ViewpointCaptured
-from service.core.run.state import JobState, RunState
+from service.core.run.state import EARLY, JobState, RunState
 from service.jobs.calibration import calibrate
 from service.jobs.kind import read_part
 from service.jobs.poses import features, match

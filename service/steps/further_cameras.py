@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 
 from service.compute.images.develop_parameters import PARAMETERS
-from service.core.jobs.references import Reference
+from service.core.jobs import Reference
 from service.core.records.events import FurtherExposure, ViewpointCaptured
 from service.core.run.state import JobState
 from service.jobs.records import ImageFile

@@ -11,8 +11,7 @@ from pydantic import Field
 
 from service.core.errors import ConfigurationError
 from service.core.gates.verdict import evaluate_gates
-from service.core.jobs.keys import key_stem
-from service.core.jobs.references import Each, Reference, jobs_of, resolve
+from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
 from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import Record, ViewHeld
 from service.core.run.state import JobState

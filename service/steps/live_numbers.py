@@ -12,13 +12,11 @@ from pydantic import Field
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import limits as gate_text
-from service.core.jobs.keys import key_stem
-from service.core.jobs.priorities import LIVE
-from service.core.jobs.references import Each, Reference, jobs_of, resolve
+from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
 from service.core.protocol.models import Gate
 from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_CT
 from service.core.records.events import FurtherExposure, Record, RecordedView, ViewpointCaptured
-from service.core.run.state import JobState
+from service.core.run.state import LIVE, JobState
 from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
 from service.jobs.capture import further_view, live_summary, live_view

@@ -10,7 +10,7 @@ import numpy as np
 from service.compute.board.board import Board
 from service.compute.board.design import CalibrationTargets
 from service.compute.planning.motion_plan import best_posture
-from service.core.arms.known import known_arm
+from service.core.arms.model import known_arm
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply
 from service.core.protocol.models import Protocol, Step

@@ -20,8 +20,7 @@ from service.compute.planning.motion_plan import (
     plan_motion,
     travel_times_s,
 )
-from service.core.arms.known import known_arm
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, known_arm
 from service.core.arms.motion_limits import motion_problems
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform

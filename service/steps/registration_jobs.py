@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 
 from service.compute.sfm.options import SfmOptions, pairs_of
-from service.core.jobs.keys import arguments_name, newest_job
-from service.core.jobs.priorities import LATER, REDUCED, WAITED
-from service.core.jobs.references import Reference, jobs_of, resolve
+from service.core.jobs import Reference, arguments_name, jobs_of, newest_job, resolve
 from service.core.protocol.models import Protocol, Step
-from service.core.run.state import JobState, RunState
+from service.core.run.state import LATER, REDUCED, WAITED, JobState, RunState
 from service.jobs import job_kinds
 from service.jobs.kind import JobRecord, read_part
 from service.jobs.poses.features import ImagesToMatch

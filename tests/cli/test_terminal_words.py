@@ -25,8 +25,7 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.compute.matching.methods.method import matchers
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import load_protocol
+from service.core.protocol.models import irreversible_warning, load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.posed.exporter import exporters
 from service.jobs.words import term

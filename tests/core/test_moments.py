@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.core.records.moments import Moment, age_s, elapsed
+from service.core.records.base import Moment, age_s, elapsed
 from service.monitor.snapshot import Snapshot
 from service.steps.kinds.timed_application import Result
 

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from service.audit.record.run import read_run
 from service.core.geometry import apply, inverse
-from service.core.jobs.references import Reference, jobs_of, references_in, resolve
+from service.core.jobs import Reference, jobs_of, references_in, resolve
 from service.jobs.registration import register
 from service.jobs.surfaces import locate_spheres
 from service.steps.kinds.ground_truth import with_located_images

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from service.cli.run.status import status_record
+from service.core.gates.release import late_s, late_words
 from service.core.geometry import look_at
-from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
 from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, RunStarted
-from service.core.results.arrival import late_s, late_words
 from service.core.run.fold import fold, initial_state
-from service.core.run.state import JobState, Note, RunState
+from service.core.run.state import LATER, REDUCED, WAITED, JobState, Note, RunState
 from service.dataset.registrations import better_later, evaluated, own_registration, registrations
 from service.dataset.summary import RunSummary
 from service.run_record import RunRecord

@@ -36,7 +36,7 @@ from service.compute.planning.motion_plan import (
     shortest_order,
     travel_times_s,
 )
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from service.core.errors import ConfigurationError
-from service.core.jobs.references import Reference
+from service.core.jobs import Reference
 from service.core.protocol.step_params import (
     NAMES_CAPTURE,
     NAMES_CT,

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from service.core.errors import ConfigurationError
-from service.core.jobs.references import Each, Jobs, Reference, jobs_of
+from service.core.jobs import Each, Jobs, Reference, jobs_of
 from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.run.state import JobState

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from service.core.errors import ComputeError, ConfigurationError
-from service.core.jobs.keys import arguments_name
+from service.core.jobs import arguments_name
 from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import ComputedBy, Record
 from service.core.units import metres

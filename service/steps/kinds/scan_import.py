@@ -10,11 +10,11 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from drivers.interfaces import ScanExport
-from service.core.jobs.references import Reference
+from service.core.jobs import Reference
 from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
+from service.core.records.base import elapsed
 from service.core.records.events import ArtefactRef, Record
-from service.core.records.moments import elapsed
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import metres
 from service.jobs.records import Point, SphereDetails
 from service.jobs.surfaces import locate_spheres, merge_scans

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.rig import Rig
 from service.run_record import RunRecord
 from service.steps.board_plan import describe_prediction

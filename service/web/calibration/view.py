@@ -8,8 +8,8 @@ from statistics import median
 
 from pydantic import BaseModel
 
-from service.core.equipment.recorded_devices import RecordedIdentity, recorded_report
 from service.core.protocol.models import Step
+from service.core.recorded_devices import RecordedIdentity, recorded_report
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
 from service.core.run.state import StepState
 from service.jobs.calibration import calibrate

@@ -1,22 +1,97 @@
-"""The operator's choices when a step is outside its limits, failed or cannot begin, with their time and loss."""
+"""What can be done about a failed step: the policy, the operator's choices with their time and loss, and words."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
 from statistics import median
 from typing import Any, Literal
 
-from service.core.gates.acceptance import acceptance_refusal, demanded_role
-from service.core.gates.dependence import dependent_steps, used_steps
-from service.core.protocol.models import Protocol, Step
+from service.core.gates.acceptance import acceptance_refusal, demanded_role, dependent_steps, used_steps
+from service.core.protocol.models import Protocol, Recovery, Step
+from service.core.records.base import seconds_between
 from service.core.records.events import OperatorVerb
-from service.core.records.moments import seconds_between
-from service.core.recovery.words import REMEDIES, UNKNOWN_REMEDY
 from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
 from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState
+
+# `abort`: a person is asked, and to end the run is what is recommended. Only a person ends a run.
+Policy = Literal["retry", "ask", "abort"]
+MOST_WAITED_OUT = 5  # further tries of a step whose failures the computer's own want of processor time explains
+
+# Names instead of classes, because core does not know the drivers and the events hold names.
+# Transient errors: the same call may succeed in a moment. (The driver has already waited for a busy camera.)
+TRIED_AGAIN = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "MachineBusyError", "StaleImageError"})
+# Only a person can put these right, whatever the protocol says. (A damaged file of the evidence is restored from a
+# copy; it is checked against its hash when it is read again.)
+NEEDS_A_PERSON = frozenset(
+    {
+        "SafetyStopError",
+        "LeaveNeededError",
+        "ArmDepartedError",
+        "ToolChangedError",
+        "DriverKilledError",
+        "DeviceChangedError",
+        "DeviceStorageFullError",
+        "IntegrityError",
+        "ImagesSpoiltError",
+        "SpaceShortError",
+        "UnforeseenError",
+    }
+)
+
+
+def recovery_policy(recovery: Recovery, error: str, failures: int, *, starved: bool = False) -> Policy:
+    """Retry, or ask the operator.
+
+    Args:
+        recovery: the step's policy from the protocol.
+        error: class name of the error that ended the work.
+        failures: consecutive failures of the step, including this one (StepState.failures + 1).
+        starved: the computer had no processor time for the work, which explains a device that was late.
+    """
+    if error in NEEDS_A_PERSON:
+        return "ask"
+    if error in TRIED_AGAIN and failures <= recovery.retries + (MOST_WAITED_OUT if starved else 0):
+        return "retry"
+    return recovery.on_failure
+
+
+# Error class → what a person does before trying again. Every class in drivers/errors.py has an entry.
+REMEDIES: Mapping[str, str] = {
+    "DeviceError": "Check the device",
+    "DeviceUnavailableError": "Check that the device is switched on and its cable or network is connected",
+    "DeviceTimeoutError": "Check that the device is awake, or that the expected file has arrived",
+    "MachineBusyError": "End what else this computer computes, or wait until it is done",
+    "DriverKilledError": "End programs that are not needed on this computer, and look at the device",
+    "DeviceChangedError": "Connect the device that was calibrated, or repeat the calibration with this one",
+    "DeviceBusyError": "Wait until the device has finished what it is doing",
+    "DeviceRefusedError": "Set the device as the message says",
+    "DeviceFaultError": "Switch the device off and on; replace it if the fault remains",
+    "DeviceStorageFullError": "Make room where the device stores its data, or insert another card",
+    "SafetyStopError": "Check the robot and the people around it, then clear the stop at the robot",
+    "LeaveNeededError": "Check that the robot stands as it should and nobody is within its reach",
+    "ArmDepartedError": "Look at what moved the robot; from where it stands now its motions are planned anew",
+    "ToolChangedError": "Ask who changed the tool or the payload at the pendant; the rig's own are set again",
+    "UnreachablePoseError": "Move the obstacle, or the robot's base, so that the robot can reach the pose",
+    "ReleasedElsewhereError": "Press the camera's own button, or connect a camera that the software can release",
+    "StaleImageError": "Check the camera: it delivered an earlier image instead of a new one",
+    "UnreadableFileError": "Export the file again, or use another one",
+    "IncompleteExportError": "Wait until the export has ended, or export again with all files",
+    "DriverMissingError": "Install the driver that the message names",
+    "DataError": "Use another file; this one cannot be used",
+    "ImagesSpoiltError": "Clean the lens, and check that its cap is off and the light is on",
+    "ComputeError": "Put right what the message names, or take what is missing",
+    "ConfigurationError": "Put right what the message names",
+    "ProtocolError": "Put right what the message names",
+    "StoreError": "Check the disk that holds the evidence: free space, cable, permissions",
+    "SpaceShortError": "Make room on the disk of the data folder, as the message says",
+    "UnforeseenError": "Put right what the message names; report it with the log",
+    "IntegrityError": "Restore the damaged file from a copy; it is checked against its hash when it is read",
+}
+UNKNOWN_REMEDY = "Put right what the message names"
+
 
 _WITH_WHAT_IS_THERE = "Judge it again with the existing images; single images are taken again on the page Capture"
 Trouble = Literal["gates", "failure", "requirements"]

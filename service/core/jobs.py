@@ -1,4 +1,4 @@
-"""References: where a job uses part of an earlier job's answer, its arguments name that part and do not copy it.
+"""Jobs of a run: their keys, references to parts of their answers, and which of them computed a step.
 
 In the JSON of an event a reference is an object with one key. `{"$from": {"job": "…", "field": "result/camera"}}` is
 one part of one answer. `{"$each": {"jobs": ["capture/0/live_view/"], "upto_seq": 81, "field": "artefacts/0/sha256",
@@ -8,13 +8,45 @@ by event `upto_seq`.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
 from typing import Any, cast
 
 from service.core.errors import IntegrityError
-from service.core.run.state import JobState, RunState
+from service.core.records.events import ComputedBy
+from service.core.run.state import JobState, RunState, StepState
+
+
+def arguments_name(arguments: Mapping[str, Any]) -> str:
+    """A hash of the arguments, 16 hexadecimal digits: equal arguments have the same name."""
+    return hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def key_stem(state: RunState, step: str, kind: str) -> str:
+    """The common prefix of the keys of all jobs of this kind that were enqueued since the step's last redo."""
+    generation = sum(past.step == step and past.viewpoint is None for past in state.superseded)
+    return f"{step}/{generation}/{kind}/"
+
+
+def job_key(state: RunState, step: str, kind: str, name: str) -> str:
+    """The key under which a job would be enqueued now.
+
+    A redo of the step begins a new generation of keys; a failed job is tried again under a new key.
+    """
+    stem = f"{key_stem(state, step, kind)}{name}/"
+    jobs = state.steps[step].jobs.values()
+    return stem + str(sum(job.idempotency_key.startswith(stem) and job.status == "failed" for job in jobs))
+
+
+def newest_job(state: RunState, step: str, kind: str, name: str) -> JobState | None:
+    """The last job for this work enqueued since the step's last redo, or None."""
+    stem = f"{key_stem(state, step, kind)}{name}/"
+    jobs = [job for job in state.steps[step].jobs.values() if job.idempotency_key.startswith(stem)]
+    return max(jobs, key=lambda job: job.enqueued_seq, default=None)
+
 
 FROM, EACH = "$from", "$each"
 Jobs = Mapping[str, JobState]
@@ -154,3 +186,44 @@ def _walk(value: Any, path: Sequence[str]) -> Any:
             return [_walk(item, path[position + 1 :]) for item in value]
         value = value[int(key)] if isinstance(value, list | tuple) else value[key]
     return value
+
+
+def computed_by(state: StepState) -> tuple[ComputedBy, ...]:
+    """The jobs whose figures a step reported as its own, as its event names them.
+
+    Events of older versions do not name them; there, a job is recognised by the values that it shares with the step.
+    """
+    return tuple(_by_values(state)) if state.computed_by is None else state.computed_by
+
+
+def answered_by(state: StepState) -> JobState | None:
+    """The newest job whose answer is part of the step's result; None if no job computed it."""
+    found = [state.jobs[source.job] for source in computed_by(state) if source.job in state.jobs]
+    for job in sorted(found, key=lambda job: job.enqueued_seq, reverse=True):
+        if job.result and job.result.keys() <= state.result.keys():
+            return job
+    return None
+
+
+def _by_values(state: StepState) -> Iterator[ComputedBy]:
+    for job in state.jobs.values():
+        if job.status != "finished":
+            continue
+        if job.result and all(state.result.get(name) == value for name, value in job.result.items()):
+            yield ComputedBy(job=job.job)
+        elif (prefix := _prefix(state, job)) is not None:
+            yield ComputedBy(job=job.job, prefix=prefix)
+
+
+def _prefix(state: StepState, job: JobState) -> str | None:
+    """What stands before the names of the job's measures in the step's; None if these are not its measures."""
+    first = next(iter(job.measures), None)
+    if first is None:
+        return None
+    for name in state.measures:
+        prefix = name.removesuffix(first)
+        if name.endswith(first) and all(
+            state.measures.get(prefix + own) == job.measures[own] for own in job.measures
+        ):
+            return prefix
+    return None

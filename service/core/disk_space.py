@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.protocol.models import Protocol
-from service.core.recovery.ways_on import planned_views
+from service.core.recovery import planned_views
 from service.core.run.state import RunState
 from service.core.units import gigabytes, megabytes
 

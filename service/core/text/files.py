@@ -1,11 +1,39 @@
-"""Read JSON from outside as plain data, with an error that names file and line whatever is wrong with it."""
+"""Reads whole text files and JSON from outside; errors name the file, the line where there is one, and what to do."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, cast
 
 from service.core.errors import DataError
+from service.core.text.delimited_text import decoded, read_table
+
+
+def file_text(path: Path) -> str:
+    """The text of a UTF-8 or UTF-16 file, with or without a mark. Raises DataError if it cannot be read."""
+    return decoded(file_bytes(path), str(path))
+
+
+def file_bytes(path: Path) -> bytes:
+    """The content of a file. Raises DataError if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: an impossible path, such as one with a null byte
+        why = getattr(error, "strerror", None) or error
+        raise DataError(f"the file cannot be read ({why})", where=str(path), remedy="Check the path") from error
+
+
+def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number from 1, cells) for each row of a file of delimited text that is not empty or a comment.
+
+    The separator and the decimal mark are found by `service.core.text.delimited_text`; numbers come with a point.
+    Raises DataError with file:line.
+    """
+    for row in read_table(file_bytes(path), str(path)).rows:
+        yield row.line, list(row.cells)
+
 
 MOST_DEEP = 100
 _LONGEST_INTEGER = 18  # digits; a longer integer is read as a float, as most JSON readers do
