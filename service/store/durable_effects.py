@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Protocol
 
-from service.core.records.moments import Moment
+from service.core.records.base import Moment
 from service.store.access import file_mode, folder_mode, make_folder, open_new
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")

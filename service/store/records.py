@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.core.jobs.priorities import WAITED
 from service.core.records.events import ArtefactRef
+from service.core.run.state import WAITED
 
 SITE = "site"  # name of the chain for events outside runs: sign-ins, accounts, keys, starts
 

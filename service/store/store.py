@@ -12,8 +12,8 @@ from typing import Any, Self
 from sqlalchemy import Connection, bindparam, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.core.run.state import Lane
 from service.core.shown_text import storable
 from service.store.access import close_to_others, require_access
 from service.store.ages import Ages

@@ -19,7 +19,7 @@ from service.audit.replay.replay import replay
 from service.audit.replay.results import ReplayReport
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
-from service.core.jobs.references import Reference, jobs_of, references_in, resolve
+from service.core.jobs import Reference, jobs_of, references_in, resolve
 from service.core.records.events import ArtefactRef
 from service.jobs import job_kinds
 from service.jobs.records import SpheresFound

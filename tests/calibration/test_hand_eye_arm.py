@@ -24,8 +24,7 @@ from service.compute.hand_eye.reprojection import BoardCorners
 from service.compute.hand_eye.setup import robust_start
 from service.compute.poses.pose_files import write_poses_csv
 from service.compute.poses.robot_files import read_joints_csv
-from service.core.arms.known import arm_model
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from service.jobs import records

@@ -25,13 +25,12 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.compute.matching.methods.method import matchers
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import load_protocol
+from service.core.protocol.models import irreversible_warning, load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.posed.exporter import exporters
 from service.jobs.words import term
 from service.steps import params_models
-from service.steps.capture.live_numbers import seen_words
+from service.steps.live_numbers import seen_words
 from tests.support.processes.forked import Forked
 
 ROOT = Path(__file__).parents[2]

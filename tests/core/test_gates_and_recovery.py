@@ -16,8 +16,7 @@ from service.core.records.events import (
     Uncertainty,
     ViewpointFailed,
 )
-from service.core.recovery.policy import NEEDS_A_PERSON, TRIED_AGAIN, recovery_policy
-from service.core.recovery.ways_on import ways_on
+from service.core.recovery import NEEDS_A_PERSON, TRIED_AGAIN, recovery_policy, ways_on
 from service.core.run.decide import (
     Halt,
     Retry,

@@ -14,8 +14,7 @@ import pytest
 
 from service.core.errors import DataError
 from service.core.protocol.models import load_protocol
-from service.core.records.attribution import Party, doi_address, licence_address, party
-from service.core.records.data_set import DataSetStatement
+from service.core.records.data_set import DataSetStatement, Party, doi_address, licence_address, party
 from service.dataset.posed.about import About
 from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.records import DataSet

@@ -17,7 +17,7 @@ from service.core.geometry import Transform, inverse, rotation_angle_rad
 from service.core.records.events import ViewpointCaptured
 from service.dataset.summary import summarise
 from service.run_start import recorded_run
-from service.steps.kinds.captures.calibration import Result
+from service.steps.kinds.calibration import Result
 from service.store.store import Store
 from tests.support.protocols.one_side import VIEWS, one_side
 from tests.support.rig.gentl_producer import ADDRESS_VARIABLE, compiled_producer

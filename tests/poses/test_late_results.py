@@ -28,7 +28,6 @@ from service.audit.verify.bundle_verifier import main as verify_bundle
 from service.cli.run.terminal.operators import Display
 from service.cli.run.terminal.waiting import wait_for_results
 from service.core.gates.verdict import evaluate_gates
-from service.core.jobs.priorities import LATER
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (
     FilesKept,
@@ -41,14 +40,15 @@ from service.core.records.events import (
     StepStarted,
 )
 from service.core.run.fold import fold
+from service.core.run.state import LATER
 from service.dataset.late_results import late_results
 from service.dataset.registrations import shared_adjustment_note
 from service.rig import load_rig
 from service.run_record import RunRecord, read_log
 from service.run_start import start_run
 from service.steps import params_models
-from service.steps.poses.sources import PLANNED
-from service.steps.poses.time_left import missing_results
+from service.steps.due_jobs import missing_results
+from service.steps.registration_sources import PLANNED
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

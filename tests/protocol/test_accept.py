@@ -19,7 +19,7 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import ProtocolError
-from service.core.gates.dependence import dependent_steps, depends_on
+from service.core.gates.acceptance import dependent_steps, depends_on
 from service.core.protocol.models import load_protocol
 from service.core.protocol.rules import NEVER_ACCEPTED
 from service.core.records.events import ActionRefused, OperatorAction

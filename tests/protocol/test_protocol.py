@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from service.core.documents.protocol_docs import lifecycle_text, schema_text
+from service.core.documents import lifecycle_text, schema_text
 from service.core.errors import ProtocolError
 from service.core.protocol.models import load_protocol, protocol_json_schema
 from tests.support.record.core import KINDS, TOY, CaptureParams, ChecklistParams, load

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.equipment.camera_clocks import clock_offset
-from service.core.equipment.clocks import clock_readings
+from service.core.clocks import clock_offset, clock_readings
 from service.core.records.events import ArtefactRef, DeviceOpened, FurtherExposure, ViewpointCaptured
 from service.store.records import NewArtefact
 from service.store.store import Store

@@ -23,7 +23,7 @@ from service.compute.planning.coverage import (
     CoverageLimits,
 )
 from service.compute.registration.hypotheses import paired
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
 from service.jobs.capture import live_view

@@ -28,10 +28,9 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.decide import AskOperator, decide, evaluate_gates
-from service.core.run.expected import duration
+from service.core.run.expected import duration, tries_words
 from service.core.run.fold import fold
-from service.core.run.tries import tries_words
-from service.core.text.clock_time import time_here
+from service.core.text.words import time_here
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
 from service.web.page.robot_banner import robot_banner

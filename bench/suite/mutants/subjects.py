@@ -7,7 +7,7 @@ from pathlib import Path
 
 # Glob patterns; `**` takes whole folders.
 SUBJECTS: dict[str, tuple[str, ...]] = {
-    "decide": ("service/core/run/**/*.py", "service/core/recovery/policy.py", "service/core/recovery/ways_on.py"),
+    "decide": ("service/core/run/**/*.py", "service/core/recovery.py"),
     "gates": ("service/core/gates/*.py", "service/core/protocol/rules.py"),
     "leases": ("service/store/queue/*.py",),
     "chain": ("service/store/events.py", "service/store/logged_events.py", "service/store/durable_effects.py"),

@@ -7,9 +7,8 @@ from typing import Any
 
 from service.audit.bundle.contents import BundledRun
 from service.audit.bundle.zip_file import ManifestEntry
-from service.core.equipment.camera_bodies import bodies
-from service.core.equipment.recorded_devices import recorded_report
 from service.core.gates.acceptance import describe_accepted
+from service.core.recorded_devices import bodies, recorded_report
 from service.core.records.events import (
     ArtefactRef,
     DeviceOpened,

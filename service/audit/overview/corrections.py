@@ -10,8 +10,8 @@ from service.audit.overview.findings import value_at, value_text
 from service.audit.record.event_rows import one_event
 from service.core.errors import DataError
 from service.core.records.events import Event, RecordCorrected
-from service.core.text.json_text import parse_json
-from service.core.text.reasons import reason_of
+from service.core.text.files import parse_json
+from service.core.text.words import reason_of
 from service.store.store import Store
 
 _UNCORRECTABLE = frozenset({"sha256", "size_bytes", "kind", "signed_sha256", "protocol_sha256"})

@@ -12,7 +12,7 @@ from service.audit.record.run_rows import plain
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, ViewpointFailed
 from service.core.run.state import RunState
-from service.core.text.counts import counted
+from service.core.text.words import counted
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from service.audit.background.incremental import IncrementalResults, PartialResu
 from service.audit.record.artefact_queries import ArtefactRow, artefacts_of_events, one_artefact
 from service.audit.record.event_rows import EventRow, read_rows
 from service.audit.record.run_rows import head, plain
-from service.core.jobs.references import Each, Reference, references_in
+from service.core.jobs import Each, Reference, references_in
 from service.core.records.events import FilesKept, JobEnqueued
 from service.store.events import parse_canonical
 from service.store.store import Store

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from service.core.jobs.references import Reference
+from service.core.jobs import Reference
 from service.core.run.state import JobState
 
 _TELLING_DIGITS = 12  # a number with so many digits is recognised by its value, since nobody typed it

@@ -11,9 +11,8 @@ import numpy as np
 from service.audit.replay.copied import CopiedResults
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
-from service.core.jobs.references import jobs_of, resolve
+from service.core.jobs import computed_by, jobs_of, resolve
 from service.core.records.events import JobFinished
-from service.core.run.computed import computed_by
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary

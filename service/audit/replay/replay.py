@@ -25,7 +25,7 @@ from service.audit.replay.results import (
 from service.audit.replay.scratch import ScratchStore
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
-from service.core.jobs.references import jobs_of, resolve
+from service.core.jobs import jobs_of, resolve
 from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, SessionStarted
 from service.core.run.state import JobState
 from service.jobs import job_kinds

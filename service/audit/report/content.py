@@ -24,7 +24,7 @@ from service.audit.report.sections.origin import devices_section, software_secti
 from service.audit.report.sections.photographs import pictures_section
 from service.audit.report.sections.verification import verification_section
 from service.core.records.import_list import imported_sentence
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.store.verification.verify import AuditReport
 
 

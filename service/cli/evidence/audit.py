@@ -34,8 +34,8 @@ from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.cli.terminal_output import listed, styled
-from service.core.text.counts import counted
 from service.core.text.person_names import cleaned_name
+from service.core.text.words import counted
 from service.core.units import megabytes
 from service.store.access import kept_to
 from service.store.durable_effects import utc_text

@@ -20,7 +20,7 @@ from service.cli.common import (
     require_writable_folder,
 )
 from service.core.errors import ConfigurationError
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.store.run_rows import resolve_run
 from service.store.verification import verify as audit
 

@@ -26,7 +26,7 @@ from service.cli.common import (
     write_whole,
 )
 from service.core.gates.measure_names import measure_name
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.store import Store

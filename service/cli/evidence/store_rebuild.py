@@ -10,7 +10,7 @@ import typer
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.store.journal.rebuild import RebuildReport, rebuild
 from service.store.store import Store
 

@@ -228,7 +228,7 @@ def open_devices(station: Station) -> OpenDevices:
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
     """What a capture step will do, in words, for the person who is asked to confirm it."""
     # Planning takes half a second to load, which a run that is answered on the screen does without.
-    from service.steps.capture.plan.preview import preview_board_poses, preview_plans  # noqa: PLC0415
+    from service.steps.plan_preview import preview_board_poses, preview_plans  # noqa: PLC0415
 
     try:
         plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))

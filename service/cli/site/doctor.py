@@ -25,8 +25,8 @@ from service.cli.common import (
 from service.cli.run.commands import RigOption
 from service.cli.shipped_protocols import protocol_file
 from service.cli.site.record_devices import record_devices
-from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
-from service.core.equipment.disk_space import Forecast, Usage, forecast
+from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
+from service.core.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import HostClock

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import LENGTH_WORDS, METRES_PER, deg, mm
 
 ClosedForm = Literal["park", "daniilidis", "tsai", "horaud", "andreff"]

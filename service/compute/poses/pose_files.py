@@ -17,10 +17,10 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import ImageFolder, strict_refusal
 from service.compute.poses.camera_files import finite_numbers, json_object
 from service.compute.sfm import colmap_process as colmap_files
-from service.core.delimited_text import TextTable, is_number, read_table
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
-from service.core.text.file_text import csv_rows, file_bytes
+from service.core.text.delimited_text import TextTable, is_number, read_table
+from service.core.text.files import csv_rows, file_bytes
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass
@@ -51,7 +51,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
         poses = read_transforms_json(path)
     elif path.suffix.lower() in {".csv", ".txt", ".tum", ".tsv"}:
         table = read_table(file_bytes(path), str(path))
-        poses = trajectory_poses(table, path) if is_trajectory(table) else read_poses_csv(path)
+        poses = _trajectory_poses(table, path) if _is_trajectory(table) else read_poses_csv(path)
     else:
         raise DataError(
             "unknown kind of pose file",
@@ -331,7 +331,7 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
 _COLUMNS = 8
 
 
-def is_trajectory(table: TextTable) -> bool:
+def _is_trajectory(table: TextTable) -> bool:
     """Whether a table has eight numbers in its first line, separated by spaces, and so no header and no names."""
     if not table.rows or table.dialect.separator != " ":
         return False
@@ -339,7 +339,7 @@ def is_trajectory(table: TextTable) -> bool:
     return len(cells) == _COLUMNS and all(map(is_number, cells))
 
 
-def trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
+def _trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
     """T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
 
     Raises:

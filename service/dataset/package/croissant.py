@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
-from service.core.records.attribution import Party
+from service.core.records.data_set import Party
 from service.dataset.package import views_table
 from service.dataset.package.crate_entities import media_type
 from service.dataset.package.croissant_context import CONTEXT

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from service.core.errors import DataError
-from service.core.records.attribution import Party, doi_address, licence_address, party
-from service.core.records.data_set import FIRST_VERSION, DataSetStatement
+from service.core.records.data_set import FIRST_VERSION, DataSetStatement, Party, doi_address, licence_address, party
 from service.jobs.registration.evaluate import ErrorBudget, Row
 
 NOT_STATED = "not stated"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, func, select, text
 
-from service.core.equipment.disk_space import LEAST_FREE_BYTES, Forecast, Usage, forecast, size_words
+from service.core.disk_space import LEAST_FREE_BYTES, Forecast, Usage, forecast, size_words
 from service.core.errors import SpaceShortError
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState

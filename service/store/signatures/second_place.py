@@ -13,7 +13,7 @@ from threading import Event, Lock, Thread
 from typing import Protocol, Self
 
 from service.core.errors import StoreError
-from service.core.text.clock_time import time_here
+from service.core.text.words import time_here
 from service.store.durable_effects import Clock, Files, Signal, utc_text
 from service.store.journal.copies import JournalCopy, journal_copy
 from service.store.signatures.log import NAME

@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse, Response
 from service.audit.overview import findings
 from service.audit.overview.devices import bodies_of_run, clock_offsets, opened_devices, sessions
 from service.audit.record import event_rows
-from service.core.equipment.clocks import clock_offset_words, clock_readings
+from service.core.clocks import clock_offset_words, clock_readings
 from service.steps.notes import deidentified
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render

@@ -20,8 +20,7 @@ from service.audit.overview.signatures import RecordedSignature
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import event_rows, run_rows
 from service.audit.record.event_rows import EventRow
-from service.core.equipment.camera_bodies import CameraBodies
-from service.core.equipment.recorded_devices import RecordedIdentity
+from service.core.recorded_devices import CameraBodies, RecordedIdentity
 from service.run_record import results_to_come
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, close_audit, link
 from service.web.audit.gates import accuracy_of
@@ -30,7 +29,7 @@ from service.web.page.rendering import TEMPLATES, render
 from service.web.security.guards import requires
 
 if TYPE_CHECKING:
-    from service.steps.poses.time_left import PendingResult
+    from service.steps.due_jobs import PendingResult
 
 
 @asynccontextmanager

@@ -16,7 +16,7 @@ from service.compute.board.board import Board
 from service.compute.board.next_poses import SuggestedPose, suggest_board_poses
 from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.estimate import HandEyeAnswer
-from service.core.arms.known import known_arm
+from service.core.arms.model import known_arm
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, Transform, inverse
 from service.core.protocol.models import CalibrationBoard as BoardSection

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.rig import Rig
 from service.run_record import RunRecord
-from service.steps.board.plan import describe_prediction
-from service.steps.capture.plan.preview import preview_board_poses
+from service.steps.board_plan import describe_prediction
 from service.steps.context import StationLayout
-from service.steps.kinds.captures.calibration import Params
+from service.steps.kinds.calibration import Params
 from service.steps.notes import BOARD_POSES, board_plans
+from service.steps.plan_preview import preview_board_poses
 from service.web.calibration.board_plan_drawing import board_plan_svg
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import station_of

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
 from service.core.errors import IllegalTransitionError
-from service.core.gates.dependence import AcceptedGate, depends_on
+from service.core.gates.acceptance import AcceptedGate, depends_on
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.records.events import Event, ViewpointCaptured

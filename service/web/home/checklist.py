@@ -9,8 +9,7 @@ from fastapi.responses import HTMLResponse
 
 from service.core.errors import ConfigurationError
 from service.core.gates.measure_names import measure_name
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import Protocol, load_protocol
+from service.core.protocol.models import Protocol, irreversible_warning, load_protocol
 from service.core.records.events import RunStarted
 from service.steps import params_models
 from service.web.page.rendering import render

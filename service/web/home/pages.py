@@ -16,7 +16,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol.models import LoadedProtocol, load_protocol
 from service.core.records.entered import RunAbout
 from service.core.records.events import RunStarted
-from service.core.run.connections import lost_arms
+from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.files.space_used import forecast_of

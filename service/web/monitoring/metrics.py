@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
 from prometheus_client.registry import Collector
 
-from service.core.equipment.clocks import ClockReading
-from service.core.equipment.disk_space import Forecast
+from service.core.clocks import ClockReading
+from service.core.disk_space import Forecast
 from service.core.errors import OrthocaptureError
 from service.monitor.figures import Figures, Health
 

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
 
-from service.core.equipment.clocks import clock_readings
-from service.core.equipment.disk_space import Forecast
+from service.core.clocks import clock_readings
+from service.core.disk_space import Forecast
 from service.core.errors import StoreError
 from service.monitor.figures import read_figures, read_health
 from service.store.files.space_used import forecast_of

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from service.audit.record.event_rows import EventRow
 
 from service.core.records.entered import RunAbout, about_rows
-from service.core.text.clock_time import local_time
-from service.core.text.counts import counted
+from service.core.text.words import counted, local_time
 from service.web.page.robot_banner import LOST
 from service.web.page.run_frame import driven_frames
 

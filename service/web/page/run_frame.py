@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from service.core.errors import OrthocaptureError
 from service.core.records.events import RunStarted
 from service.core.records.import_list import imported_sentence
-from service.core.run.tries import tries_words
-from service.core.text.clock_time import time_here
+from service.core.run.expected import tries_words
+from service.core.text.words import time_here
 from service.monitor.snapshot import Standing, read_snapshot
 from service.people.control import Control
 from service.run_record import RunRecord

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.protocol.models import Protocol
-from service.core.run.connections import lost_arms
 from service.core.run.decide import AskOperator, Decision, decide
-from service.core.run.state import RunState
+from service.core.run.state import RunState, lost_arms
 from service.monitor.snapshot import STOPS, RobotPhase, Standing
 from service.web.page.run_words import stopped_words
 

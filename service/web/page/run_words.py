@@ -6,7 +6,7 @@ from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing, figure, standing
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import GateVerdict
-from service.core.recovery.ways_on import WayOn, planned_sets, planned_views
+from service.core.recovery import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator
 from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
-from service.core.equipment.clocks import ClockReading
-from service.core.equipment.disk_space import Forecast, size_words
+from service.core.clocks import ClockReading
+from service.core.disk_space import Forecast, size_words
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step

@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse
 from pydantic import BaseModel, Field
 
 from service.core.records.events import OperatorVerb
-from service.core.text.reasons import REASON_CHARACTERS
+from service.core.text.words import REASON_CHARACTERS
 from service.people.sessions import KnownBy
 
 RunId = Annotated[str, Path(max_length=64)]

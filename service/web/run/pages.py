@@ -12,12 +12,11 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
-from service.core.gates.dependence import AcceptedGate, accepted_gates
+from service.core.gates.acceptance import AcceptedGate, accepted_gates
 from service.core.gates.release import loses_release
-from service.core.protocol.models import Step
+from service.core.protocol.models import Reasons, Step
 from service.core.records.entered import about_rows
 from service.core.records.events import ControlTaken, Event, RunStarted
-from service.core.recovery.reasons import Reasons
 from service.dataset.registrations import evaluated, shared_adjustment_note
 from service.jobs.registration.evaluate import Row
 from service.monitor.snapshot import read_snapshot

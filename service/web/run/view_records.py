@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol as Interface
 
-from service.core.gates.dependence import AcceptedGate
+from service.core.gates.acceptance import AcceptedGate
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorVerb
 from service.core.run.state import Deviation, RunState

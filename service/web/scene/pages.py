@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 
-from service.core.gates.dependence import accepted_gates
+from service.core.gates.acceptance import accepted_gates
 from service.people.control import Control
 from service.run_acts import drawing_step
 from service.web.page.rendering import render

@@ -20,8 +20,8 @@ from service.audit.report.blocks import (
 )
 from service.audit.report.drawings.charts import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report.words import judged, limit, measured, utc
-from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
-from service.core.gates.dependence import depends_on
+from service.core.gates.acceptance import depends_on
+from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import RecordedView
 from service.jobs.calibration import calibrate
 from service.jobs.calibration.records import HandEye, Intrinsics, Residuals

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Column, DescriptionList, Heading, Paragraph, Section, Table, TableCell
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")

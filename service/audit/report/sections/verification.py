@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Column, DescriptionList, Heading, Paragraph, Section, Table, TableCell
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import megabytes
 from service.store.verification.verify import AuditReport
 

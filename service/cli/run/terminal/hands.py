@@ -12,7 +12,7 @@ from typing import Any
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import Step
 from service.core.run.noted import HandWork
-from service.core.text.json_text import parse_json
+from service.core.text.files import parse_json
 
 _ASKS_FOR_A_PHOTOGRAPH = ("next: ", "take the photograph now")  # beginnings of messages that ask for a photograph
 _LONGEST_ANSWER = 1 << 20  # characters

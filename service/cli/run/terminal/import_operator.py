@@ -14,7 +14,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.jobs.words import term
 from service.runner.operator import AnswerBy
-from service.steps.kinds.imports import ct_import, image_import, scan_import
+from service.steps.kinds import ct_import, image_import, scan_import
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:

@@ -13,15 +13,14 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
 from service.core.errors import ConfigurationError, PersonNeededError
 from service.core.gates.acceptance import demanded_role
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import Protocol
+from service.core.protocol.models import Protocol, irreversible_warning
 from service.core.records.events import OperatorAction
-from service.core.recovery.ways_on import takes_words
+from service.core.recovery import takes_words
 from service.core.run.decide import AskOperator
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.core.shown_text import shown
-from service.core.text.reasons import reason_of
+from service.core.text.words import reason_of
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from service.cli.run.terminal.operators import Display
 from service.core.protocol.models import Protocol
 from service.run_record import RunFollower, results_to_come
-from service.steps.poses.time_left import duration_words
+from service.steps.due_jobs import duration_words
 from service.store.store import Store
 
 _LOOK_S = 2.0  # reading a whole run takes a sixth of a second, which the computation also needs

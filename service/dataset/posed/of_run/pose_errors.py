@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from service.core.geometry import Array
-from service.core.jobs.references import jobs_of
+from service.core.jobs import jobs_of
 from service.core.run.state import JobState
 from service.dataset.summary import RunSummary
 from service.jobs.registration import register

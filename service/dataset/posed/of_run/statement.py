@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.core.gates.dependence import accepted_gates
+from service.core.gates.acceptance import accepted_gates
 from service.core.gates.verdict import BOUNDS_HOLD
 from service.dataset.late_results import late_results
 from service.dataset.posed.of_run.about_run import gates_in_words, origin_sentence
