@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.plugins import collecting
+from tests.plugins.cost_limit import CostLimit
 from tests.plugins.cpu_record import CpuRecord
 from tests.plugins.draw import Draw
 
@@ -43,6 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR"
     )
+    parser.addoption("--cpu-below", type=float, metavar="S", help="leave out tests that cost S CPU seconds or more")
     parser.addoption("--draw", metavar="SEED", help="run a tenth of the whole runs and sweeps, chosen by SEED")
     parser.addoption(
         "--repeat", type=int, default=1, metavar="N", help="run every test N times (bench.suite.realtime)"
@@ -55,6 +58,10 @@ def pytest_configure(config: pytest.Config) -> None:
     directory: Path | None = config.getoption("--cpu-record")
     if directory is not None:
         config.pluginmanager.register(CpuRecord(directory / f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.jsonl"))
+    limit_s: float | None = config.getoption("--cpu-below")
+    if limit_s is not None:
+        costs = json.loads((Path(__file__).parent / "cpu_seconds.json").read_text(encoding="utf-8"))
+        config.pluginmanager.register(CostLimit(limit_s, costs))
     seed: str | None = config.getoption("--draw")
     if seed is not None:
         config.pluginmanager.register(Draw(seed))

@@ -1,4 +1,4 @@
-"""Marks as `slow` the tests that cost two CPU seconds or more, and keeps the list of what each test costs.
+"""Marks as `slow` the tests that cost a CPU second or more, and keeps the list of what each test costs.
 
 `make marks` runs the tests with `--cpu-record` (tests/plugins/cpu_record.py) and then this script on what they
 recorded; `make marks FILES=tests/core` measures one folder and leaves the rest of the list alone. `make lint` calls
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-LIMIT_S = 2.0
+LIMIT_S = 1.0
 LIST = Path("tests/cpu_seconds.json")
 MARK = "@pytest.mark.slow"
 Costs = dict[str, dict[str, float]]  # file → test function (`Class::test` in a class) → CPU seconds

@@ -156,6 +156,7 @@ def test_the_elbow_keeps_clear_of_the_table_and_of_the_limits_where_it_can(plann
         assert room[0] >= min(5.0, float(np.median(room)))
 
 
+@pytest.mark.slow
 def test_an_obstacle_in_the_rig_file_is_named_in_the_plan(tmp_path: Path) -> None:
     obstacle = {"from_m": [0.70, 0.0, 0.3], "to_m": [0.70, 0.0, 1.5], "radius_m": 0.3}
     station = {"robot": "robot", "scene_centre_m": [0.70, 0.0, 0.055], "approach_azimuth_deg": 180.0}

@@ -58,6 +58,7 @@ def held_already(record: LargeRecord) -> Callable[[], object]:
     return lambda: evidence.holds(last)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", [audit_show, capture_page])
 def test_twice_as_many_viewpoints_are_twice_the_work(
     records: tuple[LargeRecord, LargeRecord], asked: Callable[[LargeRecord], Callable[[], object]]
@@ -67,6 +68,7 @@ def test_twice_as_many_viewpoints_are_twice_the_work(
     assert large < MOST * small
 
 
+@pytest.mark.slow
 def test_a_page_that_follows_a_run_does_not_plan_it_anew(records: tuple[LargeRecord, LargeRecord]) -> None:
     _, record = records
     capture_page(record)()

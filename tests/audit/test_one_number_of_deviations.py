@@ -53,6 +53,7 @@ def runs(web: WebSite) -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", RUNS)
 def test_one_list_of_deviations_stands_everywhere(
     web: WebSite, runs: dict[str, str], which: str, tmp_path: Path

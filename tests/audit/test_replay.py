@@ -60,6 +60,7 @@ def moved_spheres(context: RecordedContext) -> JobAnswer:
     return JobAnswer(measures, answer.artefacts, SpheresFound.model_validate({**answer.result, "spheres_m": spheres}))
 
 
+@pytest.mark.slow
 def test_the_same_again_bit_for_bit_and_nothing_written(folder: Path) -> None:
     before = contents(folder / "data")
     report = again(folder)
@@ -74,6 +75,7 @@ def test_the_same_again_bit_for_bit_and_nothing_written(folder: Path) -> None:
     assert contents(folder / "data") == before
 
 
+@pytest.mark.slow
 def test_a_job_of_an_earlier_version_is_named_with_both_versions(folder: Path) -> None:
     located, _, registered = again(folder).jobs
     assert registered.computed_by == (
@@ -119,6 +121,7 @@ def referring(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recorded", ["folder", "referring"])
 def test_end_to_end_carries_the_change_to_the_registration(
     recorded: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
@@ -134,6 +137,7 @@ def test_end_to_end_carries_the_change_to_the_registration(
     assert drift.against_cameras_mm == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_job_that_refers_to_earlier_answers_holds_none_of_their_numbers(referring: Path) -> None:
     run = read_run(referring / "data", "latest")
     (first,), (second,), (registered,) = (tuple(state.jobs.values()) for state in run.state.steps.values())

@@ -44,6 +44,7 @@ def no_dejavu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.audit.report.output.pdf._FONT_FOLDERS", ())
 
 
+@pytest.mark.slow
 def test_it_says_the_same_on_numbered_pages(report: Report, pdf: bytes) -> None:
     pages = pages_of(pdf)
     for number, page in enumerate(pages, 1):
@@ -109,6 +110,7 @@ def test_the_same_evidence_gives_the_same_bytes(tmp_path: Path) -> None:
     assert render_pdf(report_of(tmp_path)) == render_pdf(report_of(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_dejavu")
 def test_greek_and_signs_have_glyphs_without_dejavu(report: Report) -> None:
     pdf = render_pdf(report)

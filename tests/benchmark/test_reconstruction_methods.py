@@ -241,6 +241,7 @@ def test_a_mesh_outside_the_box_of_the_truth_is_refused(dataset: DataSet, tmp_pa
         run_trial(Trial(methods()["colmap"], "dense", tmp_path, tmp_path / "far.ply"), dataset)
 
 
+@pytest.mark.slow
 def test_what_the_method_sees_beyond_the_truth_is_cut_off(dataset: DataSet, tmp_path: Path) -> None:
     wall = trimesh.creation.box(extents=[0.4, 0.4, 0.001]).apply_translation([0.0, 0.0, -0.01])
     fine = trimesh.util.concatenate([scene().mesh.subdivide().subdivide(), wall])

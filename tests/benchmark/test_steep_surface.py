@@ -148,6 +148,7 @@ def test_a_place_behind_the_known_surface_is_seen_by_no_view_and_one_before_it_i
     assert seen_through(photographs, np.concatenate([on, below, above])).tolist() == [0, 0, len(views)]
 
 
+@pytest.mark.slow
 def test_the_views_of_many_places_take_no_more_memory_than_those_of_a_few(views: list[StereoView]) -> None:
     known = RayMesh(together(*FLOORS).vertices_m, together(*FLOORS).faces)
     photographs = [photograph(view, known) for view in views] * 3

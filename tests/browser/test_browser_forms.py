@@ -149,6 +149,7 @@ def test_a_tap_on_what_must_be_held_says_so(server: Served, browser: Browser) ->
         assert [act.action for act in acts(server, run_id) if act.action == "redo"] == []
 
 
+@pytest.mark.slow
 def test_an_open_dialog_stays_when_its_question_is_over_and_what_it_says_is_refused(
     server: Served, browser: Browser
 ) -> None:
@@ -193,6 +194,7 @@ def test_a_hold_ends_when_the_button_comes_to_mean_something_else(server: Served
         assert [act.action for act in acts(server, run_id)] == ["skip", "confirm", "pause"]
 
 
+@pytest.mark.slow
 def test_what_was_sent_says_so_until_the_answer_comes(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page

@@ -261,6 +261,7 @@ def tab_faults(page: Page) -> list[str]:
     return faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "opener"),
     [

@@ -76,6 +76,7 @@ def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, brow
         assert scrolled(page) == 0
 
 
+@pytest.mark.slow
 def test_a_page_that_is_no_runs_keeps_the_robots_in_sight(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, _run_id):
         tablet.go("/account")
@@ -268,6 +269,7 @@ def test_the_live_view_changes_to_the_camera_that_is_pressed(server: Served, bro
             expect(panel.get_by_role("status")).to_have_text("Live")
 
 
+@pytest.mark.slow
 def test_a_frame_of_the_camera_that_was_left_is_not_shown_as_the_other_ones(server: Served, browser: Browser) -> None:
     with web_site(server.data.parent) as web:
         run_id = run_with_three_cameras(web)

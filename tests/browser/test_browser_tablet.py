@@ -81,6 +81,7 @@ def test_end_run_stays_where_it_is(server: Served, browser: Browser) -> None:
 # --- a link, a checklist -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_invitation_is_scanned_or_copied(server: Served, browser: Browser) -> None:
     with screen(browser, server.url) as desk:
         desk.context.grant_permissions(["clipboard-read", "clipboard-write"])
@@ -100,6 +101,7 @@ def test_an_invitation_is_scanned_or_copied(server: Served, browser: Browser) ->
         assert page.evaluate("navigator.clipboard.readText()") == page.locator("#one-time-link").inner_text()
 
 
+@pytest.mark.slow
 def test_a_checklist_is_printed_without_what_belongs_to_the_screen(server: Served, browser: Browser) -> None:
     with screen(browser, server.url) as desk:
         desk.sign_in("grace", password_of("grace"))

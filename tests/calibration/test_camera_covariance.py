@@ -29,6 +29,7 @@ def _known(sigma_f_px: float, sigma_c_px: float) -> CameraCovariance:
     return CameraCovariance(NAMES, matrix)
 
 
+@pytest.mark.slow
 def test_hand_eye_states_what_another_calibration_of_the_camera_would_change() -> None:
     known = _known(12.0, 4.0)
     session = noisy_session(24, 0.02, 0.002, 2)

@@ -58,6 +58,7 @@ def test_exact_data_gives_the_exact_answer(method: Method) -> None:
     assert result.held_out_mm.max() < 1e-5
 
 
+@pytest.mark.slow
 def test_noisy_robot_stays_within_the_bootstrap_sigma() -> None:
     ratios: list[float] = []
     for seed in range(6):

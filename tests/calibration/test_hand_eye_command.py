@@ -36,6 +36,7 @@ def _in_millimetres(T: Array) -> Array:
     return scaled
 
 
+@pytest.mark.slow
 def test_poses_that_fit_give_the_mount(photographs: BoardFolder, tmp_path: Path) -> None:
     out = tmp_path / "hand_eye.json"
     done = _run(photographs, photographs.poses(tmp_path / "poses.csv"), out)
@@ -45,6 +46,7 @@ def test_poses_that_fit_give_the_mount(photographs: BoardFolder, tmp_path: Path)
     assert np.allclose(record["T_flange_camera"], T_FLANGE_CAMERA, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words", "remedy"),
     [
@@ -95,6 +97,7 @@ def test_a_universal_robots_rows_without_header_are_read(photographs: BoardFolde
     assert _run(photographs, poses, out, "--length", "mm").exit_code == 0
 
 
+@pytest.mark.slow
 def test_poses_of_other_images_fit_nothing(photographs: BoardFolder, tmp_path: Path) -> None:
     mixed = list(photographs.T_base_flange.values())
     poses = photographs.poses(tmp_path / "poses.csv", mixed[4:] + mixed[:4])
@@ -104,6 +107,7 @@ def test_poses_of_other_images_fit_nothing(photographs: BoardFolder, tmp_path: P
     assert not (tmp_path / "hand_eye.json").exists()
 
 
+@pytest.mark.slow
 def test_a_camera_beside_the_robot_is_placed_in_the_base(photographs: BoardFolder, tmp_path: Path) -> None:
     # The same images, interpreted the other way round: the board's pose becomes the flange's.
     poses = photographs.poses(tmp_path / "poses.csv", [inverse(T) for T in photographs.T_base_flange.values()])

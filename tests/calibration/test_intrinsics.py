@@ -189,6 +189,7 @@ def _random_views(count: int, seed: int, *, noise_px: float = 0.04, shared_px: f
     return views
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared_px", [0.0, 0.02])
 def test_stated_covariance_is_honest_also_when_the_corners_of_an_image_err_together(shared_px: float) -> None:
     squares: list[float] = []
@@ -244,6 +245,7 @@ def test_projection_uncertainty_counts_each_view_in_whatever_order_they_were_tak
     assert np.allclose(first.sigma_px, second.sigma_px, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
     """Each calibrated camera is moved to fit the boards, as happens when its pose is estimated."""
     projected: list[Array] = []

@@ -60,6 +60,7 @@ def _run(folder: Path, out: Path, *more: str) -> Result:
     return CliRunner().invoke(app, [*words, "--out", str(out), *more])
 
 
+@pytest.mark.slow
 def test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads(folder: Path, tmp_path: Path) -> None:
     out, report = tmp_path / "camera.json", tmp_path / "report"
     done = _run(folder, out, "--report", str(report), "--distance-m", "0.6", "--json")
@@ -87,6 +88,7 @@ def test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads(folde
     assert any("8 views" in warning for warning in record["warnings"])
 
 
+@pytest.mark.slow
 def test_a_focus_motor_that_moved_is_named_and_a_body_that_does_not_tell_is_said(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -101,6 +103,7 @@ def test_a_focus_motor_that_moved_is_named_and_a_body_that_does_not_tell_is_said
     assert "do not state the focus distance: a change of focus would go unnoticed" in done.output
 
 
+@pytest.mark.slow
 def test_a_zoom_that_moved_after_the_calibration_is_named(folder: Path, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     capture.mkdir()

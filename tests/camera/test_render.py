@@ -111,6 +111,7 @@ def test_a_sphere_covers_exactly_what_its_outline_encloses(scene: Scene) -> None
         assert [(cover * u).sum() / cover.sum(), (cover * v).sum() / cover.sum()] == pytest.approx(middle, abs=0.005)
 
 
+@pytest.mark.slow
 def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture, scene: Scene) -> None:
     camera = CameraModel(**dataclasses.asdict(scene.camera_intrinsics(WIDTH)))
     found = detect_spheres(np.ascontiguousarray(plain[..., ::-1]), camera)
@@ -205,6 +206,7 @@ def test_a_scaled_lens_sees_the_same_directions(scene: Scene) -> None:
 # --- exposure and noise -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_exposure_follows_the_settings_and_the_light(renderer: Renderer, scene: Scene, plain: Picture) -> None:
     changes: list[tuple[Mapping[str, float], float, float]] = [
         ({"exposure_s": 1 / 30}, NOMINAL_LUX, 0.5),
@@ -255,6 +257,7 @@ def test_control_spheres_and_spray_change_only_what_they_touch(
         assert np.abs(sprayed[patch].astype(float) - plain[patch]).mean() < 3
 
 
+@pytest.mark.slow
 def test_the_preview_is_small_and_shows_the_same(scene: Scene, plain: Picture) -> None:
     wide = Renderer(780)
     assert WIDTH < PREVIEW_WIDTH < wide.image_width

@@ -90,6 +90,7 @@ def test_files_are_those_on_the_card_and_advance(tmp_path: Path) -> None:
     assert (first.lens, first.body_serial) == ("RF24-70mm F2.8 L IS USM", "042021006092")
 
 
+@pytest.mark.slow
 def test_large_files_come_in_parts(tmp_path: Path) -> None:
     """Beyond a megabyte, libgphoto2 asks for parts."""
     log = tmp_path / "truth.jsonl"

@@ -305,6 +305,7 @@ def test_doctor_says_what_is_missing(tmp_path: Path) -> None:
     assert report["data"]["free_bytes"] > 0
 
 
+@pytest.mark.slow
 def test_doctor_says_that_the_library_of_an_arm_is_not_installed(tmp_path: Path) -> None:
     absent = tmp_path / "absent"  # hides the installed library, as if there were none
     absent.mkdir()

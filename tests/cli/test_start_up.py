@@ -72,6 +72,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause", "resume --help"])
 def test_it_starts_without_numerics(words: str, data: Path) -> None:
     folder = () if "--" in words else ("--data", str(data))
@@ -90,6 +91,7 @@ def test_the_state_of_a_run_that_computes_is_told_without_numerics(tmp_path: Pat
     assert not not_of_this_run & set(outcome["modules"])
 
 
+@pytest.mark.slow
 def test_a_server_is_ready_before_it_has_what_single_pages_need(data: Path, tmp_path: Path) -> None:
     rig = data.parent / "rig.yaml"
     outcome = said_by(AT_READY, "serve", "--rig", str(rig), "--data", str(tmp_path / "new"), "--port", "0", "--json")

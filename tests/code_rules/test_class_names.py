@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from collections import defaultdict
 
+import pytest
+
 from tests.support.rig.rig import REPOSITORY
 
 # Every kind of step or job declares its records by these names, and they are read as `module.Name`.
@@ -26,6 +28,7 @@ def public_classes() -> dict[str, list[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_a_public_class_has_a_name_of_its_own() -> None:
     shared = {name: modules for name, modules in public_classes().items() if len(modules) > 1}
     confusing = {name: modules for name, modules in shared.items() if name not in _OF_A_KIND and not _twins(modules)}

@@ -8,11 +8,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from bench.suite.marks import costs_of, disagreements, remarked, settled
 from tests.plugins.collecting import dearest_first, is_compiled
+from tests.plugins.cost_limit import CostLimit
 from tests.plugins.cpu_record import cpu_s_of_tree
 from tests.plugins.draw import drawn
 
@@ -58,6 +61,7 @@ def test_a_tenth_is_drawn_by_the_seed_and_every_unit_has_its_turn() -> None:
     assert drawn("a", []) == set()
 
 
+@pytest.mark.slow
 def test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed(tmp_path: Path) -> None:
     source = """
 import pytest
@@ -196,12 +200,12 @@ def test_marks_follow_from_the_costs_and_the_check_names_what_disagrees() -> Non
     ("before_s", "now_s", "listed_s"),
     [
         (None, 1.234, 1.2),
-        (1.0, 1.2, 1.0),
-        (1.0, 1.5, 1.5),
-        (1.9, 2.3, 1.9),
-        (1.9, 2.5, 2.5),
-        (2.2, 1.7, 2.2),
-        (9, 1, 1),
+        (0.5, 0.6, 0.5),
+        (0.5, 0.9, 0.9),
+        (0.9, 1.15, 0.9),
+        (0.9, 1.3, 1.3),
+        (1.1, 0.85, 1.1),
+        (9, 0.5, 0.5),
     ],
 )
 def test_a_measurement_near_the_limit_changes_no_mark(before_s: float | None, now_s: float, listed_s: float) -> None:
@@ -231,3 +235,19 @@ def test_the_list_is_written_from_records_and_then_the_check_is_content(
     assert marked.startswith("import pytest\n\nfrom tests")
     assert "@pytest.mark.slow\ndef test_it" in marked
     assert json.loads((tmp_path / "tests/cpu_seconds.json").read_text()) == {"tests/test_it.py": {"test_it": 5.0}}
+
+
+def test_tests_that_cost_more_than_asked_for_are_left_out(tmp_path: Path) -> None:
+    items = [
+        SimpleNamespace(nodeid=f"tests/code_rules/test_suite_rules.py::{name}")
+        for name in ("test_dear[row-1]", "TestAll::test_dear_too", "test_cheap", "test_unknown")
+    ]
+    costs = {"test_dear": 2.0, "TestAll::test_dear_too": 9.0, "test_cheap": 1.9}
+    left_out: list[SimpleNamespace] = []
+    config: Any = SimpleNamespace(
+        hook=SimpleNamespace(pytest_deselected=lambda *, items: left_out.extend(items))
+    )
+    limit = CostLimit(2.0, {"tests/code_rules/test_suite_rules.py": costs})
+    limit.pytest_collection_modifyitems(config, items)  # pyright: ignore[reportArgumentType]
+    assert [item.nodeid.rpartition("::")[2] for item in items] == ["test_cheap", "test_unknown"]
+    assert len(left_out) == 2

@@ -10,6 +10,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 REPOSITORY = Path(__file__).parents[2]
 CLOCKS = {
     "time": {
@@ -138,6 +140,7 @@ def _found(folder: str) -> dict[str, list[int]]:
     return {path: lines for path, lines in calls.items() if lines}
 
 
+@pytest.mark.slow
 def test_the_service_is_given_its_time() -> None:
     found = _found("service")
     assert not {path: lines for path, lines in found.items() if path not in SERVICE}, "take the store's clock"

@@ -44,6 +44,7 @@ def _calls(node: ast.AST) -> set[str]:
     return {ast.unparse(call.func) for call in ast.walk(node) if isinstance(call, ast.Call)}
 
 
+@pytest.mark.slow
 def test_least_squares_is_iterated_in_one_module() -> None:
     found = {
         path.relative_to(COMPUTE).as_posix()

@@ -46,6 +46,7 @@ def enhance(slices: Path, target: Path) -> Array:
     return T
 
 
+@pytest.mark.slow
 def test_an_enhanced_file_is_read_as_its_slices_are(tmp_path: Path) -> None:
     T = enhance(tmp_path / "slices", tmp_path / "enhanced")
     series = only(tmp_path / "enhanced")

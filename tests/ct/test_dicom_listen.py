@@ -102,6 +102,7 @@ def slices(folder: Path) -> list[Dataset]:
 # --- whole series -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sender", ["pynetdicom", pytest.param("dcmtk", marks=pytest.mark.packages("dcmtk"))])
 def test_another_program_sends_a_series_and_the_importer_reads_it(tmp_path: Path, sender: str) -> None:
     T = write_series(tmp_path / "suite", uid=UID, change=hospital)

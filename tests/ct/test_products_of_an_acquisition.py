@@ -101,6 +101,7 @@ def test_several_series_are_ordered_by_when_they_were_written(tmp_path: Path) ->
     assert [one.files[0].parent.name for one in found] == ["9.1", "1.1", "5.1"]
 
 
+@pytest.mark.slow
 def test_an_import_takes_the_product_that_is_named_and_names_them_all_otherwise(tmp_path: Path) -> None:
     deliver(tmp_path / "ct")
     for role, grey in (("calibration", 90), ("image", 120)):

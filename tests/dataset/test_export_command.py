@@ -44,6 +44,7 @@ def export(data: Path, *arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.slow
 def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "colmap"
     status, printed = export(recorded, "--format", "colmap", "--out", str(out), "--operator", "Erika", "--json")
@@ -71,6 +72,7 @@ def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path:
             assert pixel is None or np.abs(pixel - 0.5 - ours).max() < 0.01
 
 
+@pytest.mark.slow
 def test_an_anonymous_export_has_none_of_the_scanners_own_files(recorded: Path, tmp_path: Path) -> None:
     for options, held in (((), True), (("--anonymous",), False)):
         out = tmp_path / f"plain{len(options)}"

@@ -125,6 +125,7 @@ def _try(target: Path) -> str:
         return error.what
 
 
+@pytest.mark.slow
 def test_two_processes_do_not_write_one_export(tmp_path: Path) -> None:
     with export_folder(tmp_path / "out", "x") as folder:
         folder.text("a.txt", "a")

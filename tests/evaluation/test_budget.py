@@ -140,6 +140,7 @@ def budget_of(seed: int, stated_m: float = SIGMA_M) -> ErrorBudget:
     )
 
 
+@pytest.mark.slow
 def test_the_budget_sums_its_parts_and_agrees_with_what_is_observed() -> None:
     chi2: dict[str, list[float]] = {}
     for seed in range(5):

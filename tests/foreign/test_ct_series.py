@@ -132,6 +132,7 @@ def test_values_of_another_unit_are_not_called_hounsfield(kind: str, words: str,
         source.read(series)
 
 
+@pytest.mark.slow
 def test_frames_of_an_enhanced_file_are_checked_as_slices_are(tmp_path: Path) -> None:
     """Written by highdicom; one frame's type and unit, and the padding, are changed as programs state them there."""
     write_series(tmp_path / "slices", change=hospital)

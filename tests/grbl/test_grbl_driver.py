@@ -288,6 +288,7 @@ def test_a_lost_answer_to_a_piece_of_a_motion_costs_a_moment(tmp_path: Path) -> 
         np.testing.assert_allclose(degrees(arm), [-40], atol=0.02)
 
 
+@pytest.mark.slow
 def test_axes_that_ran_dry_do_not_move_on_by_themselves(tmp_path: Path) -> None:
     with table(tmp_path) as port, Tap(port, tmp_path, losing(3, b"$J=")) as tap, losing_answers(tap) as arm:
         let_move(arm)
@@ -341,6 +342,7 @@ def test_a_pulled_cable_is_unavailable_and_opens_again(tmp_path: Path) -> None:
         travel(arm, -10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["drop", "corrupt", "truncate", "stall"])
 def test_spoilt_reports_do_not_stop_a_motion(tmp_path: Path, kind: str) -> None:
     with table(tmp_path, *fault(on="?", kind=kind, nth=30, times=2, value=0.1)) as port, opened(port) as arm:

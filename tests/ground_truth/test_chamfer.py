@@ -170,6 +170,7 @@ def test_regions_hold_each_sample_once_and_those_together_that_lie_together(
     assert np.mean([np.prod(np.ptp(region.points_m[:, :2], axis=0)) for region in regions]) < 0.5 * 0.012 * 0.008
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 1000), n=st.integers(1, 60), spread=st.floats(0.001, 0.1))
 @settings(max_examples=25, deadline=None)
 def test_the_distance_to_the_faces_is_exact(seed: int, n: int, spread: float) -> None:
@@ -268,6 +269,7 @@ def test_the_command_prints_the_scores_of_meshes_of_any_format(tmp_path: Path, s
     assert (record["excluded"], record["n_pred"], record["n_gt"]) == (0, 9_600, 9_600)
 
 
+@pytest.mark.slow
 def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path) -> None:
     tilted = plane().moved(transform(Rotation.from_rotvec([0, 0.12, 0]), np.zeros(3)))
     pred, gt = written(tmp_path / "pred.ply", tilted), written(tmp_path / "gt.ply", plane())

@@ -60,6 +60,7 @@ def top_error(of: Fused) -> tuple[IntArray, Array]:
     return top, (z - height(x, y)) / np.sqrt(1 + slope**2)
 
 
+@pytest.mark.slow
 def test_the_fused_mesh_is_within_a_tenth_of_a_millimetre_and_the_scans_part_within_its_noise() -> None:
     result = fused(CT_NOISE_M, SCAN_NOISE_M)
     top, error = top_error(result)

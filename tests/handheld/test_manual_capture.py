@@ -27,6 +27,7 @@ def result(bench: Bench) -> StepMeasured:
     return next(p for p in bench.payloads(StepMeasured) if p.step == "capture")
 
 
+@pytest.mark.slow
 def test_who_follows_the_words_covers_the_hemisphere(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -45,6 +46,7 @@ def test_who_follows_the_words_covers_the_hemisphere(
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_used_stays_in_the_evidence_with_the_reason(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -63,6 +65,7 @@ def test_what_cannot_be_used_stays_in_the_evidence_with_the_reason(
     assert any("h_002: not used: blurred" in line for line in bench.operator.told)
 
 
+@pytest.mark.slow
 def test_a_first_image_that_cannot_be_used_does_no_harm(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -72,6 +75,7 @@ def test_a_first_image_that_cannot_be_used_does_no_harm(
     assert len([line for line in bench.operator.told if "cm above the middle of the specimen" in line]) == 2
 
 
+@pytest.mark.slow
 def test_a_repeated_image_is_told_apart(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -131,6 +135,7 @@ def test_the_pedal_releases_and_a_step_without_images_asks(
     assert failed.error == "DeviceTimeoutError"
 
 
+@pytest.mark.slow
 def test_the_level_frame_of_all_images_is_that_of_the_first(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -145,6 +150,7 @@ def test_the_level_frame_of_all_images_is_that_of_the_first(
     assert len(frames) == len(person.views)
 
 
+@pytest.mark.slow
 def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

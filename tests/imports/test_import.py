@@ -76,6 +76,7 @@ def refusal(*words: str) -> str:
     return f"{error['what']} {error['where']} {error['remedy']}"
 
 
+@pytest.mark.slow
 def test_odd_files_are_left_out_by_name_with_the_reason(folder: Path) -> None:
     images = folder / "images"
     first, second = sorted(images.glob("*.JPG"))
@@ -105,6 +106,7 @@ def test_odd_files_are_left_out_by_name_with_the_reason(folder: Path) -> None:
     assert views[first.stem].camera["exif_time"].startswith("2024:03:01 10:03")
 
 
+@pytest.mark.slow
 def test_a_picture_of_another_kind_is_named_and_the_import_goes_on(folder: Path) -> None:
     heic = folder / "images" / "DSC00099.JPG"
     heic.write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(200))
@@ -130,6 +132,7 @@ def test_what_the_protocol_needs_must_be_there(folder: Path) -> None:
     assert "there is no such place for ct" in refusal(str(folder), "--ct", "nowhere", "--dry-run")
 
 
+@pytest.mark.slow
 def test_nobody_imports_in_the_name_of_an_account_without_its_password(folder: Path, tmp_path: Path) -> None:
     with web_site(tmp_path):
         pass
@@ -146,6 +149,7 @@ def test_one_whole_series_is_the_ct(folder: Path) -> None:
     assert "no complete CT series" in refusal(str(folder), "--dry-run")
 
 
+@pytest.mark.slow
 def test_a_series_whose_first_slices_are_missing_is_taken_only_on_purpose(folder: Path, tmp_path: Path) -> None:
     first, second, *rest = sorted((folder / "ct").glob("*.dcm"))
     for path in (first, second):
@@ -174,6 +178,7 @@ def test_equal_names_in_several_folders_stay_apart(folder: Path) -> None:
     assert {view.name for view in listed(folder).of("image")} == {"image_DSC00003", "image_side_DSC00003"}
 
 
+@pytest.mark.slow
 def test_a_dry_run_shows_and_records_nothing(folder: Path, tmp_path: Path) -> None:
     words = ["import", str(folder), "--dry-run", "--data", str(tmp_path / "data")]
     shown = CliRunner().invoke(app, words, catch_exceptions=False)

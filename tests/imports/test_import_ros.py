@@ -111,6 +111,7 @@ def check_poses(out: Path, photographs: BoardFolder, atol: float = 1e-9) -> None
         np.testing.assert_allclose(poses[f"{stamp_of(k)}.jpg"], T, atol=atol)
 
 
+@pytest.mark.slow
 def test_a_recording_calibrates_a_hand_eye_as_its_files_would(photographs: BoardFolder, tmp_path: Path) -> None:
     bag, out = recorded(photographs, tmp_path / "bag"), tmp_path / "out"
     done = run(bag, "--out", out, *FRAMES, "--camera-frame", "camera_optical")

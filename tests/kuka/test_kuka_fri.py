@@ -172,6 +172,7 @@ def last_second(arm: RobotArm) -> tuple[RobotSample, ...]:
     return arm.samples(now_s - 1.0, now_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", ["1", "2.5", "2.7"])
 def test_its_samples_are_the_pose_stream(version: str) -> None:
     host = address(91)
@@ -255,6 +256,7 @@ def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
             pass
 
 
+@pytest.mark.slow
 def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     host = address(96)
     rig = tmp_path / "rig.yaml"

@@ -87,6 +87,7 @@ def connected(host: str) -> Generator[Client]:
         client.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stubs", "folders"),
     [
@@ -109,6 +110,7 @@ def test_only_the_layer_of_a_version_names_the_maker_s_classes() -> None:
         assert "com.kuka" not in path.read_text(encoding="utf-8"), path
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_silent_client_has_its_arm_stopped_after_0_3_s_and_must_permit_again() -> None:
     host = address(81)
@@ -132,6 +134,7 @@ def test_a_silent_client_has_its_arm_stopped_after_0_3_s_and_must_permit_again()
         assert client.ask(**MOVE)["is"] == "ack"
 
 
+@pytest.mark.slow
 def test_a_stop_of_the_safety_controller_latches_and_cancels_the_motion() -> None:
     host = address(82)
     with sunrise_engine(host), connected(host) as client:

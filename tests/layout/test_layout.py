@@ -204,6 +204,7 @@ def test_an_outline_whose_size_errs_is_that_of_its_known_sphere(sphere: int) -> 
     check_layout(found.centres_m, found.covariance, radius_m=scene.radius_m)
 
 
+@pytest.mark.slow
 def test_bounds_hold_the_truth_as_often_as_they_say() -> None:
     centres = np.concatenate([Scene.generate(34).registration_m, Scene.generate(34).control_m])
     truth = check_layout(centres).margin_m

@@ -108,6 +108,7 @@ def test_both_networks_are_loaded_offline_and_search_an_image(tiny: Weights, mon
         assert min(np.arccos(np.clip(outline.cone.axis @ e.cone.axis, -1, 1)) for e in exact) < 0.01
 
 
+@pytest.mark.slow
 @needs_torch
 def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
     torch, transformers, pillow = (
@@ -127,6 +128,7 @@ def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
     assert np.allclose(scores, torch.sigmoid(expected.logits).max(-1)[0].numpy(), atol=1e-5)
 
 
+@pytest.mark.slow
 @needs_torch
 @pytest.mark.parametrize("how", ["damaged", "another network"])
 def test_other_weights_are_refused(tiny: Weights, tmp_path: Path, how: str) -> None:
@@ -141,6 +143,7 @@ def test_other_weights_are_refused(tiny: Weights, tmp_path: Path, how: str) -> N
     assert told.value.where == str(tmp_path / "sam2")
 
 
+@pytest.mark.slow
 def test_boxes_masks_and_edges_give_the_outlines() -> None:
     made = scene(1, width=1200, seed=2)
     image = render(made.camera, made.centres_camera(0, EVERY))

@@ -145,6 +145,7 @@ def perfect(made: Scene, located: LocatedOutlines, poses: Array, scale: bool) ->
     )
 
 
+@pytest.mark.slow
 def test_spheres_that_no_list_names_are_found_too(captured: Captured) -> None:
     made, paths, _ = captured
     located = locate_outlines(
@@ -156,6 +157,7 @@ def test_spheres_that_no_list_names_are_found_too(captured: Captured) -> None:
     assert all(m < len(REGISTRATION_M) for a in located.assignments for m in a.markers.values())
 
 
+@pytest.mark.slow
 def test_an_image_that_shows_nothing_is_searched_whole(captured: Captured, tmp_path: Path) -> None:
     made, paths, _ = captured
     anchors = spread_views(made.T_world_camera, np.arange(N), 4)

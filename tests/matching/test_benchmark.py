@@ -98,6 +98,7 @@ def test_the_folder_has_table_curves_and_pictures(scored: tuple[Path, Any]) -> N
         assert picture.std() > 5
 
 
+@pytest.mark.slow
 def test_methods_share_a_table_if_they_share_their_pairs(
     folder: Path, scored: tuple[Path, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

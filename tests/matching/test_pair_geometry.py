@@ -184,6 +184,7 @@ def test_a_pair_is_as_difficult_as_the_worst_of_its_measures(
     assert name in CLASSES
 
 
+@pytest.mark.slow
 def test_the_relative_covariance_is_that_of_draws() -> None:
     rng = np.random.default_rng(4)
     first, second = pose((0.3, 0.2, 0.4)), pose((1.9, 0.25, 0.3))

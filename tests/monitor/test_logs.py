@@ -78,6 +78,7 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
     assert terminal.getvalue() == "the lens is cold\n"
 
 
+@pytest.mark.slow
 def test_the_processes_of_a_run_log_and_speak_to_the_terminal_as_ever(tmp_path: Path) -> None:
     _, begun = record_runs(tmp_path)
     resume = command("resume", "latest", "--data", str(tmp_path / "data"))
@@ -141,6 +142,7 @@ with file_log(data, sys.argv[2], handler=BoundedFile(data, file_bytes=20_000, fi
 """
 
 
+@pytest.mark.slow
 def test_several_processes_share_a_log_that_is_bounded(tmp_path: Path) -> None:
     data = tmp_path / "data"
     data.mkdir()
@@ -231,6 +233,7 @@ def test_what_is_no_secret_stays() -> None:
     assert without_secrets({"passed": 3, "pin_failures": 2}) == {"passed": 3, "pin_failures": 2}
 
 
+@pytest.mark.slow
 def test_a_server_logs_no_password_pin_token_or_link(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: a small site\nsimulated: true\ndevices: {}\n")

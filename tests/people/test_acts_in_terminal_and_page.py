@@ -231,6 +231,7 @@ def test_an_arm_that_was_lost_is_seen(tmp_path: Path) -> None:
     assert call(data, "act", "seen", "--operator", "Ada")[0] == 1  # nothing is lost any more
 
 
+@pytest.mark.slow
 def test_a_region_is_drawn(tmp_path: Path) -> None:
     data = tmp_path / "data"
     record_run(tmp_path, complete=False, protocol=REGISTERED + FUSION)

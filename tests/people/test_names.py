@@ -123,11 +123,13 @@ def refused_at(site: NamedSite, place: str, names: Iterable[str]) -> None:
         assert attempt.refused_for_its_name, attempt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", COMMANDS)
 def test_where_there_are_accounts_nobody_else_acts(site: NamedSite, place: str) -> None:
     refused_at(site, place, FEW[:4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", COMMANDS)
 def test_where_there_are_none_nobody_acts_under_a_name_that_is_no_persons(without: NamedSite, place: str) -> None:
     refused_at(without, place, FEW_OF_NOBODY)

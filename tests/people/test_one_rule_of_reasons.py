@@ -51,6 +51,7 @@ PLACES: dict[str, Callable[[Office, str, str], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", PLACES)
 def test_a_reason_says_something_and_is_no_book(office: Office, run: str, place: str) -> None:
     for typed in ("  ", TOO_LONG):

@@ -176,6 +176,7 @@ def test_an_administrator_clears_every_wait_on_the_page(tmp_path: Path) -> None:
         assert site.browser().sign_in("emmy").status_code == 303
 
 
+@pytest.mark.slow
 def test_an_administrator_clears_it_on_the_command_line(tmp_path: Path) -> None:
     with web_site(tmp_path) as site:
         emmy, data = site.browser("supervisor"), ["--data", str(site.site.data), "--password-stdin"]

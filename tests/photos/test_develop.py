@@ -119,6 +119,7 @@ def warped(jpeg: Path, change: str) -> NDArray[np.uint8]:
     return leaves(seed=4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "words"), [
     ("distortion corrected", r"up to 0\.\d+ px.*distortion compensation"), ("half a pixel", r"up to 0\.[67]\d px"),
     ("smaller", "240 × 160.*full size"), ("another picture", "do not show the same picture"),

@@ -98,6 +98,7 @@ def test_strict_refuses_odd_files_by_name(odd: BoardFolder, tmp_path: Path, comm
         assert words in done.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["intrinsics", "hand-eye"])
 def test_odd_files_are_left_out_by_name(odd: BoardFolder, tmp_path: Path, command: str) -> None:
     done = _invoke(*_commands(odd, tmp_path)[command])
@@ -125,6 +126,7 @@ def test_images_all_of_another_size_blame_the_camera_model(photographs: BoardFol
         image_folder(photographs.images, size=(450, 300))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["bmp", "pgm", "pnm", "png", "tif"])
 def test_other_formats_of_images_are_read(photographs: BoardFolder, tmp_path: Path, suffix: str) -> None:
     images = tmp_path / "images"
@@ -139,6 +141,7 @@ def test_other_formats_of_images_are_read(photographs: BoardFolder, tmp_path: Pa
     assert json.loads((tmp_path / "camera.json").read_text())["n_views"] == 8
 
 
+@pytest.mark.slow
 def test_a_camera_without_distortion_is_a_pinhole_camera(photographs: BoardFolder, tmp_path: Path) -> None:
     pinhole = {key: value for key, value in CAMERA.record().items() if key not in ("k1", "k2", "p1", "p2")}
     camera = tmp_path / "camera.json"

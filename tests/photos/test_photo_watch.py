@@ -70,6 +70,7 @@ def test_while_one_file_arrives_those_that_are_there_wait(card: Path, tmp_path: 
     assert names(camera, tmp_path, 5.0) == ["DSC00001.JPG", "DSC00002.JPG"]
 
 
+@pytest.mark.slow
 def test_the_same_bytes_are_taken_once(card: Path, tmp_path: Path) -> None:
     camera = watching(card)
     put(card, "DSC00001.JPG", photograph(1, after(1)))

@@ -218,6 +218,7 @@ def test_wrong_size_or_broken_image_is_named(
         reconstruct({**images, "small.png": small}, SfmWorkspace(tmp_path / "b", camera, OPTIONS))
 
 
+@pytest.mark.slow
 def test_unrelated_images_give_no_model(camera: CameraModel, tmp_path: Path) -> None:
     paths: list[Path] = []
     for k in range(3):

@@ -282,6 +282,7 @@ def test_lateness_counts_from_when_the_specimen_was_freed() -> None:
     assert late_words(demo, initial_state(demo), 720.0) == "arrived 12 min after the end of the run"
 
 
+@pytest.mark.slow
 def test_a_result_that_arrives_after_the_end_of_a_run_is_recorded_as_late_signed_and_verifies(tmp_path: Path) -> None:
     run_id = record_run(tmp_path)
     data = tmp_path / "data"

@@ -115,6 +115,7 @@ def test_a_worker_computes_side_by_side_and_ends_when_nothing_is_left(store: Sto
     assert [end.error for end in ends] == ["IntegrityError"] * 3
 
 
+@pytest.mark.slow
 def test_a_child_that_is_killed_is_replaced_and_its_job_done_again(store: Store, tmp_path: Path) -> None:
     run = start_run(store)
     with Pool(store, tmp_path / "data", 1) as pool:
@@ -126,6 +127,7 @@ def test_a_child_that_is_killed_is_replaced_and_its_job_done_again(store: Store,
     assert isinstance(store.events(run)[-1].payload, JobFailed)
 
 
+@pytest.mark.slow
 def test_the_job_of_a_killed_child_is_claimed_again_and_given_up_after_some_times(store: Store) -> None:
     run = start_run(store)
     job = enqueue(store, run, "deadly")

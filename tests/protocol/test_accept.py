@@ -284,6 +284,7 @@ def act(folder: Path, run: str, name: str, typed: str | None = None) -> Result:
     return invoke(*command, *(["--password-stdin"] if typed is not None else []), typed=typed)
 
 
+@pytest.mark.slow
 def test_act_asks_for_the_password_of_an_account_of_that_role(web: WebSite) -> None:
     bench = failed_capture(web)
     assert act(web.folder, bench.run_id, "emmy", "wrong\n").exit_code == 1
@@ -300,6 +301,7 @@ def plainly(folder: Path, run: str, verb: str, name: str, typed: str | None = No
     return invoke(*command, *(["--password-stdin"] if typed is not None else []), typed=typed)
 
 
+@pytest.mark.slow
 def test_whoever_acts_in_the_name_of_an_account_gives_its_password(web: WebSite) -> None:
     bench = failed_capture(web)
     assert plainly(web.folder, bench.run_id, "confirm", "emmy", "guessed\n").exit_code == 1

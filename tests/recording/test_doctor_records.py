@@ -34,6 +34,7 @@ def recorded(folder: Path, rig: str) -> Recording:
     return Recording.model_validate_json((folder / "out.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_folders_and_what_does_not_open_stand_in_the_file(tmp_path: Path) -> None:
     write_series(tmp_path / "ct", change=hospital)
     (tmp_path / "scans").mkdir()

@@ -152,6 +152,7 @@ def test_hands_that_cannot_do_it_say_so(bench: Bench, world: _World, monkeypatch
         automatic_run(bench, world)
 
 
+@pytest.mark.slow
 def test_the_newest_advice_counts_with_its_words_and_its_hands(bench: Bench, world: _World) -> None:
     bench.rig.shutter.exif = other_settings
 

@@ -117,6 +117,7 @@ def test_poses_are_as_wrong_as_stated(known: list[Known], refined: bool) -> None
     assert 0.75 < np.mean(of_pairs) < 1.3
 
 
+@pytest.mark.slow
 def test_light_on_single_spheres_is_in_what_is_stated_of_refined_poses() -> None:
     """Views from all sides see a sphere where it is not: no residual tells, and the cameras are tilted with it."""
     aware, unaware = list[float](), list[float]()

@@ -102,6 +102,7 @@ def test_clean_inputs_have_no_finding_and_the_sigma_that_they_had() -> None:
     assert [e.name for e in result.beyond.errors if e.significant] == []
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_measured_and_named_and_its_effect_is_counted() -> None:
     wrong = replace(MADE.camera, fx=MADE.camera.fx * 1.001, fy=MADE.camera.fy * 1.001)
     outlines = changed(seen(), through(wrong))
@@ -233,6 +234,7 @@ def test_an_image_of_another_scene_is_left_out() -> None:
     assert in_sigma(result) < 3
 
 
+@pytest.mark.slow
 def test_if_too_many_images_contradict_one_another_none_is_left_out_and_the_result_is_refused() -> None:
     poses = MADE.T_world_camera.copy()
     for i in range(5):

@@ -84,6 +84,7 @@ def test_exact_data_give_the_exact_poses_scale_and_stations(seed: int) -> None:
     assert np.abs(answer.T_world_camera - T_world_scan @ made.T_scan_camera).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_noise_is_estimated_and_covariances_are_honest() -> None:
     joint: list[float] = []
     scan: list[float] = []
@@ -162,6 +163,7 @@ def test_a_wrong_principal_point_is_found_with_the_calibration_as_prior() -> Non
     assert np.sqrt(np.mean(better[:, 3:] ** 2)) < 0.5 * np.sqrt(np.mean(worse[:, 3:] ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [True, False])
 def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> None:
     """Cameras with errors of their calibration's covariance: without it the stated sigma is far too small."""
@@ -250,6 +252,7 @@ def test_derivatives_of_every_component() -> None:
         assert np.abs(numeric - analytic).max() < 2e-3 * np.abs(numeric).max(), name
 
 
+@pytest.mark.slow
 def test_covariance_of_structure_from_motion_is_honest() -> None:
     ratios: list[float] = []
     for seed in range(6):

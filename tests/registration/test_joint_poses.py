@@ -34,6 +34,7 @@ def registered(seed: int, errors: np.ndarray) -> tuple[RegistrationResult, np.nd
     return answer, apply(answer.T_world_scan, CENTRE) - apply(made.T_world_scan, CENTRE)
 
 
+@pytest.mark.slow
 def test_errors_that_all_images_share_are_stated_in_full() -> None:
     # Half of each pose's error is common to all images, like a tilted frame; half is its own.
     sigma = np.array([0.05e-3] * 3 + [0.05e-3] * 3)

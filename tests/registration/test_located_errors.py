@@ -145,6 +145,7 @@ def squared(e: Array, covariance: Array) -> float:
     return float(e @ np.linalg.solve(covariance, e)) / len(e)
 
 
+@pytest.mark.slow
 def test_poses_are_as_wrong_as_stated(answers: list[Located]) -> None:
     of_single, of_all = list[float](), list[float]()
     for one in answers:
@@ -158,6 +159,7 @@ def test_poses_are_as_wrong_as_stated(answers: list[Located]) -> None:
     assert 0.7 < np.mean(of_single) < 1.4
 
 
+@pytest.mark.slow
 def test_a_pose_errs_by_more_than_the_registration_and_by_less_than_the_hand(answers: list[Located]) -> None:
     for one in answers:
         shared_m = np.sqrt(np.trace(np.array(one.record.covariance)[:3, :3]))
@@ -166,6 +168,7 @@ def test_a_pose_errs_by_more_than_the_registration_and_by_less_than_the_hand(ans
         assert np.sqrt((one.errors()[:, :3] ** 2).sum(axis=1).mean()) < 0.4 * HELD_SIGMA_M
 
 
+@pytest.mark.slow
 def test_an_image_with_three_spheres_is_left_out(answers: list[Located]) -> None:
     for one in answers:
         assert FEW not in one.record.T_scan_camera

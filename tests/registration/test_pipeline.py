@@ -90,6 +90,7 @@ def test_two_processes_give_the_same_outlines(captured: Captured) -> None:
         assert [o.centre_px for o in a] == [o.centre_px for o in b]
 
 
+@pytest.mark.slow
 def test_half_a_jpeg_is_refused_by_name(captured: Captured, tmp_path: Path) -> None:
     made, paths, _ = captured
     data = paths[0].read_bytes()

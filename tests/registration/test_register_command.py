@@ -142,6 +142,7 @@ def true_error_mm(record: dict[str, Any], capture: Capture) -> float:
 # --- what it computes -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_spheres_and_csv(capture: Capture, record: dict[str, Any]) -> None:
     assert true_error_mm(record, capture) < 0.1
     assert record["scale"] == 1.0
@@ -155,6 +156,7 @@ def test_spheres_and_csv(capture: Capture, record: dict[str, Any]) -> None:
     assert np.all((sigma_m > 1e-7) & (sigma_m < 1e-2))
 
 
+@pytest.mark.slow
 def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, record: dict[str, Any]) -> None:
     assert [entry["image"] for entry in record["images"]] == sorted(capture.T_world_camera)
     seen = 0
@@ -299,6 +301,7 @@ def test_photographs_of_another_size_than_the_calibrated(capture: Capture, few: 
     refused(register(capture, out, images=few), out, f"{WIDTH} × 440 px", "camera model is for")
 
 
+@pytest.mark.slow
 def test_photographs_that_show_too_few_spheres(capture: Capture, few: Path, tmp_path: Path) -> None:
     for file in few.iterdir():
         picture = cv2.imread(str(file))
@@ -317,6 +320,7 @@ def test_a_cloud_of_three_points(capture: Capture, tmp_path: Path) -> None:
     refused(result, out, "found 0 spheres", "unit")
 
 
+@pytest.mark.slow
 def test_a_control_index_that_the_mesh_has_not(capture: Capture, tmp_path: Path) -> None:
     out = tmp_path / "result.json"
     result = register(capture, out, spheres=None, mesh=capture.mesh, radius_mm=15, mesh_unit="mm", control="2,13")
@@ -346,6 +350,7 @@ def test_wrong_usage_has_status_2(capture: Capture, tmp_path: Path, changes: dic
     assert words in result.output
 
 
+@pytest.mark.slow
 def test_the_papers_detector_takes_the_boxes_of_another(capture: Capture, few: Path, tmp_path: Path) -> None:
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps({"DSC00001.JPG": [[10, 10, 5, 20]]}))

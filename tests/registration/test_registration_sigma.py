@@ -62,6 +62,7 @@ def chi2(result: RegistrationResult, made: Scene) -> float:
     return float(both @ np.linalg.solve(result.covariance, both)) / 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pose_sigma", "sphere_sigma_m", "main"),
     [((0.0, 0.0), 0.0, "outlines"), ((2e-4, 2e-4), 0.0, "poses"), ((0.0, 0.0), 5e-5, "spheres")],
@@ -163,6 +164,7 @@ def test_a_turned_frame_changes_nothing() -> None:
     assert a.sigma_at_m(TARGET) == pytest.approx(b.sigma_at_m(TARGET), rel=0.05)
 
 
+@pytest.mark.slow
 def test_refined_cameras_are_placed_as_well_as_stated() -> None:
     """The scan relative to the cameras, with the arm's errors removed."""
     made = scene(8, seed=4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.registration.cost import CommonErrors, RegistrationSettings
@@ -72,6 +73,7 @@ def squared(T: Array, true: Array, covariance: Array) -> float:
     return float(e @ np.linalg.solve(covariance, e)) / 6
 
 
+@pytest.mark.slow
 def test_poses_of_a_simulated_arm_are_as_wrong_as_stated() -> None:
     known = [registered(seed) for seed in range(1, SCENES + 1)]
     for refined in (False, True):

@@ -206,6 +206,7 @@ def test_what_is_computed_ahead_is_written_when_asked_for_and_shows_the_scene_as
     assert len(list(Path(ready["scan_folder"]).iterdir())) == 1
 
 
+@pytest.mark.slow
 def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
     with rig_process(tmp_path) as (process, ready, processes):
         assert len(processes) >= 4
@@ -248,6 +249,7 @@ def test_a_rig_has_the_camera_that_was_recorded(tmp_path: Path) -> None:
             camera.close()
 
 
+@pytest.mark.slow
 def test_only_a_sony_can_be_one_that_was_recorded(tmp_path: Path) -> None:
     words = ("--scene", "3", "--dir", str(tmp_path), "--camera", "Canon EOS R5", "--recorded", "ilce-7rm5-2.02")
     answer = orthocapture("simulate", "rig", *words)

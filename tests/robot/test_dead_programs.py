@@ -73,6 +73,7 @@ def comes_to_rest(watch: WorldWatch, since_s: float, lateness: Lateness) -> None
     assert went_on_s <= limit_s, f"{went_on_s:.3f} s instead of {limit_s:.3f} s"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", ["program", "driver"])
 @pytest.mark.parametrize("name", RIGS)
 def test_killed(name: str, victim: str, tmp_path: Path) -> None:

@@ -160,6 +160,7 @@ def crowded(pid: int, rivals: int = 4) -> Generator[None]:
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_call_that_waits_for_a_processor_is_given_that_time_besides() -> None:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=1.5, name="squeezed")
@@ -170,6 +171,7 @@ def test_a_call_that_waits_for_a_processor_is_given_that_time_besides() -> None:
     device.close()
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_call_that_has_waited_long_enough_for_a_processor_names_the_machine() -> None:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=0.5, name="squeezed")

@@ -108,6 +108,7 @@ def test_a_frozen_field_is_named(
         watched(told)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["actual_qd", "actual_TCP_speed"])
 def test_a_controller_whose_field_freezes_is_no_longer_believed(field: str) -> None:
     """Before, the motion came to its end as if all were well."""

@@ -70,6 +70,7 @@ def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten() -> None:
     host = address(62)
     # The plan causes the stop at a message that only this test sends: nobody queries the arm meanwhile.
@@ -189,6 +190,7 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
     drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; commands still pass
     with faulty(61, drop), opened(address(61), stale_after_s=STALE_S) as arm:

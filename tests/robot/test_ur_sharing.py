@@ -83,6 +83,7 @@ def pid_of(arm: RobotArm) -> int:
 IMPATIENT = {"watchdog_s": 1.0, "stale_after_s": 1.0, "unattended_s": 5.0, "rest_within_s": 1.5}
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_driver_that_was_cut_off_says_so_and_moves_again_only_for_a_person(moving: bool) -> None:

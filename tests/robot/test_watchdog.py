@@ -58,6 +58,7 @@ KILLED: dict[str, tuple[str, ...]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victims", KILLED.values(), ids=KILLED)
 def test_killed(victims: tuple[str, ...]) -> None:
     with moving(70) as (program, arm), Lateness() as lateness:

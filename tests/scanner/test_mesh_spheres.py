@@ -123,6 +123,7 @@ def test_wrong_count_says_what_was_found() -> None:
     assert caught.value.remedy
 
 
+@pytest.mark.slow
 def test_wrong_unit_finds_nothing() -> None:
     vertices, faces = _scan(noise_m=5e-5)
     with pytest.raises(ComputeError, match="found 0 spheres"):
@@ -143,6 +144,7 @@ CONSTELLATION = np.concatenate(
 )
 
 
+@pytest.mark.slow
 @given(
     rotation=st.tuples(*[st.floats(-3, 3)] * 3),
     shift=st.tuples(*[st.floats(-2, 2)] * 3),

@@ -115,6 +115,7 @@ def test_the_scan_is_in_a_frame_of_its_own_and_in_millimetres(sprayed: Scanned, 
     assert 300_000 < sprayed.mesh.findings["faces"] < 1_200_000
 
 
+@pytest.mark.slow
 def test_the_underside_and_what_lies_deep_are_missing(coarse: Scanned) -> None:
     world = coarse.world_m
     assert world[:, 2].min() > -0.0185
@@ -128,6 +129,7 @@ def test_without_spray_more_is_missing(sprayed: Scanned, glossy: Scanned) -> Non
     assert glossy.tissue_area_m2() < 1.1 * sprayed.tissue_area_m2()
 
 
+@pytest.mark.slow
 def test_normals_face_outwards(coarse: Scanned) -> None:
     normals = coarse.mesh.mesh.normals @ coarse.T_world_scan[:3, :3].T
     board = np.abs(coarse.world_m[:, 2]) < 0.0005
@@ -144,6 +146,7 @@ def test_other_formats_hold_the_same_scan(tmp_path: Path, form: str) -> None:
     assert names == ({"scan_01.obj", "scan_01.MTL", "scan_01_0.PNG"} if form == "obj" else {"scan_01.stl"})
 
 
+@pytest.mark.slow
 def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: Path) -> None:
     scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, unit="mm", stable_s=0.0))
     seen: list[str] = []
@@ -255,6 +258,7 @@ def test_ct_has_only_air_above_the_specimen_also_where_a_ray_meets_an_edge(
     assert volume.max() < -850  # such a ray filled half a voxel all the way up: -450
 
 
+@pytest.mark.slow
 def test_ct_materials_and_noise(coarse_ct: Ct) -> None:
     T_voxel_world = inverse_affine(coarse_ct.volume.T_ct_voxel) @ inverse(coarse_ct.T_world_ct)
 
@@ -270,6 +274,7 @@ def test_ct_materials_and_noise(coarse_ct: Ct) -> None:
     assert around(np.array([-0.2, -0.15, -0.009])).mean() == pytest.approx(-480, abs=10)
 
 
+@pytest.mark.slow
 def test_ct_frame_is_oblique(coarse_ct: Ct) -> None:
     assert (
         np.max(np.abs(coarse_ct.T_world_ct[:3, :3] @ coarse_ct.volume.T_ct_voxel[:3, :3] / 1.5e-3), axis=1).min()
@@ -301,6 +306,7 @@ def test_ct_faults_are_found(tmp_path: Path, fault: dict[str, object], words: st
     assert words in " ".join(series.problems)
 
 
+@pytest.mark.slow
 def test_a_ct_fault_plan_reaches_the_simulator(tmp_path: Path) -> None:
     plan = json.dumps([{"device": "ct", "on": "slice", "nth": 20, "kind": "drop", "times": 2}])
     words = ("ct", "--scene", str(SEED), "--folder", str(tmp_path), "--once", "--voxel-mm", "4", "--faults", plan)

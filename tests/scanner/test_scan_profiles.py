@@ -242,6 +242,7 @@ def e57(path: Path, *views: tuple[Array, Array], structured: bool = True) -> Non
             file.write_scan_raw(data, translation=translation)
 
 
+@pytest.mark.slow
 def test_views_of_an_e57_file_are_put_at_their_poses(tmp_path: Path) -> None:
     points = seen_mm(486, 300) / 1000
     left, right = points.copy(), points.copy()

@@ -104,6 +104,7 @@ def test_a_strip_of_a_sphere_is_no_cap() -> None:
         locate_spheres(points, faces, 0.015)
 
 
+@pytest.mark.slow
 def test_models_of_few_vertices_never_end_in_a_fault() -> None:
     # Long facets cover a sphere's area with vertices at two places: a matrix of rank two (LinAlgError).
     rng = np.random.default_rng(1)

@@ -30,6 +30,7 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path) -> None:
     with serving(rig) as server:
         assert server.url.startswith("http://127.0.0.1:")
@@ -86,6 +87,7 @@ def test_a_server_that_was_killed_keeps_no_other_from_serving(rig: Path) -> None
     assert (rig.parent / "data" / "serving.json").read_bytes() == b""
 
 
+@pytest.mark.slow
 def test_it_serves_while_the_second_place_of_the_signatures_is_away(rig: Path) -> None:
     rig.write_text(rig.read_text() + 'signature_copy: "[gone]/[/mnt]/signatures.jsonl"\n')
     copy = rig.parent / "[gone]" / "[" / "mnt]" / "signatures.jsonl"
@@ -100,6 +102,7 @@ def test_it_serves_while_the_second_place_of_the_signatures_is_away(rig: Path) -
     assert "[gone]/[/mnt]/signatures.jsonl" in server.log.read_text()
 
 
+@pytest.mark.slow
 def test_it_serves_while_the_second_place_hangs(rig: Path) -> None:
     rig.write_text(rig.read_text() + "signature_copy: share.jsonl\n")
     os.mkfifo(rig.parent / "share.jsonl")

@@ -100,6 +100,7 @@ def test_1100_half_open_requests_shut_nobody_out_and_are_told_in_a_few_lines(rig
     assert "more messages like this were left out" in server.log.read_text()
 
 
+@pytest.mark.slow
 def test_one_address_leaves_room_for_others(rig: Path) -> None:
     with (
         serving(rig, "--connections", "12", "--address-connections", "8", "--client-wait-s", "300") as server,
@@ -149,6 +150,7 @@ def test_a_client_that_never_begins_tls_is_left(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S, verify=trust).status_code == 200
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_when_no_more_files_can_be_opened_it_neither_spins_nor_floods_the_log(rig: Path) -> None:
     with serving(rig) as server:
@@ -186,6 +188,7 @@ def test_what_is_no_http_is_told_once_and_counted(rig: Path) -> None:
 # --- streams of news -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_sign_in_has_six_streams_the_newest_and_strangers_do_not_end_them(rig: Path) -> None:
     with Store.open(rig.parent / "data") as store:
         run_id = begin_run(store, PROTOCOL, rig.parent).run_id
@@ -252,6 +255,7 @@ def test_a_forwarded_address_passes_no_limit_stands_in_no_record_and_a_restart_f
         assert 0 < int(refused.headers["retry-after"]) <= 300
 
 
+@pytest.mark.slow
 def test_of_a_trusted_proxys_words_the_last_stranger_counts(rig: Path) -> None:
     with serving(rig, "--trusted-proxy", "127.0.0.1", "--trusted-proxy", "2001:db8::5") as server:
         for forwarded in (

@@ -125,6 +125,7 @@ def test_nobody_gets_in_without_signing_in(site: WebSite, run_id: str) -> None:
     assert events_of(site, run_id) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_each_role_may_what_the_table_says_and_nothing_else(site: WebSite, run_id: str, role: Role) -> None:
     browser = site.browser(role)
@@ -153,6 +154,7 @@ def test_a_form_of_an_allowed_role_gets_past_the_guard(site: WebSite, run_id: st
             assert answer.status_code not in (401, 423, 500), (way, answer.status_code, answer.text)
 
 
+@pytest.mark.slow
 def test_a_form_without_the_token_of_its_sign_in_is_refused(site: WebSite, run_id: str) -> None:
     other = site.browser("supervisor").person.csrf
     for role in ROLES:

@@ -132,6 +132,7 @@ def test_names_and_addresses_that_it_has(site: WebSite, host: str) -> None:
 # --- hostile input -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_hostile_names_in_addresses(site: WebSite, run_id: str, hostile: str) -> None:
     browser = site.browser("supervisor")

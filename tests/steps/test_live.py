@@ -54,6 +54,7 @@ def pictures() -> tuple[Scene, list[Any]]:
     return made, [render(made.camera, made.centres_camera(i, SPHERES_M), seed=i) for i in range(3)]
 
 
+@pytest.mark.slow
 def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     T_camera_scan = inverse(made.T_world_camera[0]) @ made.T_world_scan
@@ -86,6 +87,7 @@ def test_clipped_pixels_are_counted_whichever_channel_clips() -> None:
     assert clipped_fraction(image) == pytest.approx(0.375)
 
 
+@pytest.mark.slow
 def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     known, views = None, list[LiveView]()

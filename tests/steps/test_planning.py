@@ -406,6 +406,7 @@ def test_many_stretches_compared_at_once_give_the_order_of_one_by_one(digits: in
     assert len(calls) >= len(best), "whoever waits for it is told that it goes on"
 
 
+@pytest.mark.slow
 def test_a_plan_in_the_listed_order_does_not_compare_every_viewpoint_with_every_other(
     scene: PlanningScene,
 ) -> None:

@@ -229,6 +229,7 @@ def test_an_altered_database_is_not_restored(tmp_path: Path, data: Path) -> None
     assert not (tmp_path / "restored" / "orthocapture.sqlite").exists()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_in_the_restored_folder(tmp_path: Path) -> None:
     _, begun = record_runs(tmp_path)
     assert command("store", "backup", tmp_path / "backup", "--data", tmp_path / "data")[0] == 0

@@ -76,6 +76,7 @@ def sweep(data: Path, crash_at: int | None) -> tuple[CrashingFiles, bool]:
     return files, True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power_lost", [False, True])
 def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power_lost: bool) -> None:
     shutil.copytree(before, tmp_path / "whole")

@@ -155,6 +155,7 @@ with Store.open(Path(sys.argv[1])) as store:
 """
 
 
+@pytest.mark.slow
 def test_racing_workers_do_each_job_once(tmp_path: Path) -> None:
     with Store.open(tmp_path) as store:
         run = start_run(store)

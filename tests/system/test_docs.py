@@ -382,6 +382,7 @@ def test_the_extras_that_documents_install_are_declared() -> None:
 _OF_EXPORTS = ("dataset.md", "matching.md")
 
 
+@pytest.mark.slow
 def test_snippets_of_python_run(site: Site) -> None:
     snippets = [
         block

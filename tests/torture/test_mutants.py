@@ -151,7 +151,11 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
 
     folder = tree(tmp_path)
     selected = recorded(folder, TEST).selected("gates", GATES, 18)
-    (folder / "pyproject.toml").write_text("[tool.pytest.ini_options]\nmarkers = ['slow', 'realtime']\n")
+    (folder / "pyproject.toml").write_text(
+        "[tool.pytest.ini_options]\nmarkers = ['packages', 'realtime', 'sweep', 'whole']\n"
+    )
+    option = 'def pytest_addoption(parser): parser.addoption("--cpu-below")\n'
+    (folder / "conftest.py").write_text(option)
     place = Place("gates", GATES, 0, "test")
     mutation = mutated(folder, place)
     assert mutation is not None

@@ -37,6 +37,7 @@ class Lines(bundle_verifier.Bundle):
         return io.BytesIO(self._files[name])
 
 
+@pytest.mark.slow
 @given(VALUES)
 @settings(deadline=None, max_examples=300)
 @example({"\u20ac": 1, "\r": 2, "\ufb33": 3, "1": 4, "\U0001f600": 5, "\x80": 6, "\u00f6": 7})

@@ -421,6 +421,7 @@ def test_the_first_look_of_a_process_which_reads_everything_keeps_nobody_waiting
     assert free == [True, False, False], "first without the others waiting, then for what is new"
 
 
+@pytest.mark.slow
 def test_a_signature_costs_the_same_however_old_the_site_is(data: Path) -> None:
     """Counted in executed lines of the program and of the libraries by which it reads the database and the log."""
 

@@ -286,6 +286,7 @@ def test_a_crash_while_the_key_is_changed_leaves_one_key(
     assert faults(store) == []
 
 
+@pytest.mark.slow
 def test_several_processes_sign_with_one_key(store: Store) -> None:
     code = (
         "import sys, pathlib\nfrom service.store.store import Store\n"

@@ -169,6 +169,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
             yield from places(item, (*path, key))
 
 
+@pytest.mark.slow
 def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked: Path) -> None:
     chance = random.Random(4)
     other = [None, True, -1, 1.5, "", "x", "\0", [], {}, [1], {"a": 1}, "0" * 64]

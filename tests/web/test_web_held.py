@@ -67,6 +67,7 @@ def test_the_page_says_where_to_go_and_what_became_of_the_images(
     assert "way-arrow" in answer.text
 
 
+@pytest.mark.slow
 def test_the_buttons_ask_the_step(acted_on: tuple[WebSite, Browser, Bench]) -> None:
     _, browser, bench = acted_on
     for what in ("release", "finish"):
@@ -112,6 +113,7 @@ def test_parts_of_the_page_come_alone(shown: tuple[WebSite, Browser, Bench]) -> 
     assert answer.text.count("<template") == 4
 
 
+@pytest.mark.slow
 def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,6 +124,7 @@ def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
         assert "take it again from the same place" in page
 
 
+@pytest.mark.slow
 def test_a_camera_without_a_cable_has_no_release_and_no_live_view_on_the_page(
     acted_on: tuple[WebSite, Browser, Bench],
 ) -> None:

@@ -59,6 +59,7 @@ def drawn(site: WebSite, run: str) -> list[tuple[str, RegionDrawn]]:
     return [(e.actor, e.payload) for e in events if isinstance(e.payload, RegionDrawn)]
 
 
+@pytest.mark.slow
 def test_a_region_is_recorded_with_the_name_of_who_drew_it(drawn_on: tuple[WebSite, Browser, str]) -> None:
     site, browser, run = drawn_on
     page = browser.get(f"/runs/{run}/scene").text

@@ -36,6 +36,8 @@ LIBRARIES = (
 )
 CPU_FACTOR, CPU_LEAST_S = 8.0, 40  # a mutation may need longer than its tests did, and is then taken for a hang
 WALL_S = 900.0
+#: Options that choose the tests which mutants meet: more than `make test` runs, but none of whole runs or the clock.
+CHOSEN = ("-m", "not (realtime or packages or whole or sweep)", "--cpu-below", "2")
 BATCHES = (3, 8)  # files of tests that are collected together at first, and next
 
 Outcome = Literal["killed", "survived", "hung", "untested", "broken"]
@@ -190,9 +192,8 @@ def _try(tree: Path, selected: Sequence[Selected], told: Path) -> None:
                         "ignore::pytest.PytestAssertRewriteWarning",
                         "-p",
                         "no:cacheprovider",
-                        "-m",
-                        "not slow and not realtime",
                     ),
+                    *CHOSEN,
                     *("--basetemp", str(tree / "build" / "tmp")),
                     *(argument for one in batch for argument in one.arguments),
                 ],

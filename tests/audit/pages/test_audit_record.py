@@ -53,6 +53,7 @@ def test_digest_agrees_with_the_fold_of_all_events(store: Store, run: str) -> No
     assert sum(digest.facets.kinds.values()) == digest.seq == len(store.events(run))
 
 
+@pytest.mark.slow
 def test_digest_agrees_with_the_fold_after_a_redo_and_goes_on_from_where_it_was(tmp_path: Path) -> None:
     run = record_run(tmp_path, complete=False)
     with Store.open(tmp_path / "data") as store:

@@ -179,6 +179,7 @@ def test_an_altered_run_is_not_released(web: WebSite, supervisor: Browser) -> No
     assert "Sign and release" in verified(web, supervisor, run)
 
 
+@pytest.mark.slow
 def test_an_auditor_makes_and_downloads_report_and_bundle(web: WebSite, run: str, supervisor: Browser) -> None:
     auditor = web.browser("auditor")
     unreleased = record_reported_run(web.folder, person="grace", release="second_person")
