@@ -23,8 +23,8 @@ from service.jobs.words import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
 from service.store.database.engine import RESTORE
-from service.store.queue.leases import RunLease
 from service.store.records import NewArtefact, NewJob
+from service.store.runs import RunLease
 from service.store.store import Store
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ from service.compute.memory import keep_freed_memory
 from service.core.records.events import ArtefactRef
 from service.core.units import metres
 from service.jobs.surfaces import coverage_points, ct_surface, fuse, locate_spheres
-from service.store.files.artefacts import hash_file
+from service.store.artefacts import hash_file
 from service.worker.job import JobAnswer, JobContext, RecordedContext, handler_of
 from simulators.ct_suite.volume import grid_around, voxelise
 from simulators.scan_station.station import scan_scene

@@ -10,7 +10,7 @@ from service.core.equipment.disk_space import Forecast, Verdict
 from service.core.protocol.models import Protocol
 from service.core.records.events import StepNote
 from service.runner.held_run import HeldRun
-from service.store.files.space_used import forecast_of, require_space
+from service.store.disk_space import forecast_of, require_space
 
 _FORECAST_EVERY_S = 30.0
 _LOOK_EVERY_S = 2.0  # in this time a camera cannot fill the space that is kept free

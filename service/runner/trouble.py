@@ -9,7 +9,7 @@ from drivers.errors import DeviceError
 from service.core.errors import IntegrityError, StoreError
 from service.runner.operator import Operator
 from service.steps.context import Devices
-from service.store.errors import LeaseHeldError, LeaseLostError, RecordDamagedError
+from service.store.records import LeaseHeldError, LeaseLostError, RecordDamagedError
 from service.store.store import Store
 
 PASSING = (StoreError, OSError, MemoryError, DeviceError)

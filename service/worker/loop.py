@@ -23,8 +23,7 @@ from service.jobs.kind import Demand
 from service.jobs.memory_grants import MemoryGrants
 from service.jobs.words import term
 from service.logs.file_log import at
-from service.store.errors import LeaseLostError
-from service.store.records import Job
+from service.store.records import Job, LeaseLostError
 from service.store.store import Store
 from service.worker.job import Handler, JobAnswer, JobContext, handler_of
 

@@ -28,8 +28,8 @@ EDGES = {
     # rows of SQL, and their hashes
     "service/people/rows.py": "the row of a session, which is hashed",
     "service/store/events.py": "hashes and writes the rows of events",
-    "service/store/files/artefacts.py": "hashes the row of an artefact",
-    "service/store/queue/leases.py": "values of a row",
+    "service/store/artefacts.py": "hashes the row of an artefact",
+    "service/store/runs.py": "values of a row",
     "service/store/signatures/checkpoints.py": "payloads of rows, from which keys of every version are read",
     "service/store/store.py": "an answer as it is written into its event",
     "service/store/verification/chain_checks.py": "checks rows that may be altered and no longer records",

@@ -20,7 +20,7 @@ from service.audit.verify import bundle_verifier
 from service.cli.evidence.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
 from service.core.records.events import EvidenceExported, RunReleased, StepNote
-from service.store.files.artefacts import hash_file
+from service.store.artefacts import hash_file
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -9,8 +9,8 @@ from pathlib import Path
 SUBJECTS: dict[str, tuple[str, ...]] = {
     "decide": ("service/core/run/**/*.py", "service/core/recovery/policy.py", "service/core/recovery/ways_on.py"),
     "gates": ("service/core/gates/*.py", "service/core/protocol/rules.py"),
-    "leases": ("service/store/queue/*.py",),
-    "chain": ("service/store/events.py", "service/store/logged_events.py", "service/store/durable_effects.py"),
+    "leases": ("service/store/runs.py", "service/store/jobs.py"),
+    "chain": ("service/store/events.py", "service/store/store.py", "service/store/durable_effects.py"),
     "signatures": ("service/store/signatures/*.py",),
     "verifier": ("service/store/verification/*.py", "service/audit/verify/bundle_verifier.py"),
     "cost": ("service/compute/registration/least_squares/*.py", "service/compute/registration/solve.py"),

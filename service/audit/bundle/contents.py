@@ -20,11 +20,11 @@ from service.core.records.events import Event, RunStarted
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.people.rows import full_names
+from service.store.artefacts import chunks_of, read_artefacts
 from service.store.database.tables import artefacts as artefact_table
 from service.store.database.tables import events as event_table
 from service.store.database.tables import jobs as job_table
 from service.store.events import canonical, event_text, parse_canonical, read_events
-from service.store.files.artefacts import chunks_of, read_artefacts
 from service.store.records import SITE, Artefact
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 from service.store.signatures.signing import PublicKey

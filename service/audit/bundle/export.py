@@ -20,9 +20,9 @@ from service.core.records.events import EvidenceExported, RunStarted
 from service.core.run.fold import fold
 from service.dataset.package.crate_entities import METADATA
 from service.run_start import recorded_run
+from service.store.artefacts import hash_file
+from service.store.disk_space import require_export_space
 from service.store.events import canonical
-from service.store.files.artefacts import hash_file
-from service.store.files.space_used import require_export_space
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint, public_keys, sign
 from service.store.store import Store

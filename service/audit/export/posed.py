@@ -19,7 +19,7 @@ from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
 from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
 from service.dataset.posed.records import DataSet
 from service.dataset.summary import RunSummary
-from service.store.files.space_used import require_export_space
+from service.store.disk_space import require_export_space
 from service.store.store import Store
 
 _SIZE = re.compile(r"([1-9]\d{0,5})x([1-9]\d{0,5})")

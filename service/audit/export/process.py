@@ -18,8 +18,8 @@ from service.audit.bundle.zip_file import writing_bundle
 from service.audit.export.exports import FORMAT
 from service.audit.export.wanted import forget_request, kept_request
 from service.core.errors import ConfigurationError
-from service.store.files.artefacts import chunks_of
-from service.store.files.space_used import require_export_space
+from service.store.artefacts import chunks_of
+from service.store.disk_space import require_export_space
 from service.store.store import Store
 
 if TYPE_CHECKING:

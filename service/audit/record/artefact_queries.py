@@ -11,7 +11,7 @@ from sqlalchemy import Connection, text
 
 from service.audit.record.filters import Filter
 from service.audit.record.run_rows import PAGE, head, plain
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 
 _LARGEST_PAGE = 10**6
 

@@ -14,8 +14,8 @@ from service.audit.record.run_rows import LARGEST_SEQ, head, plain
 from service.core.errors import IntegrityError
 from service.core.records.base import Record
 from service.core.records.events import RunStarted
-from service.store.errors import UnknownRunError
 from service.store.events import event_sha256, parse_canonical
+from service.store.records import UnknownRunError
 from service.store.verification.chain_checks import summary
 
 P = TypeVar("P", bound=Record)

@@ -14,12 +14,12 @@ from service.core.run.state import RunState
 from service.dataset.summary import RunSummary
 from service.people.rows import full_names, named
 from service.steps import params_models
+from service.store.artefacts import ArtefactFiles, read_artefacts
 from service.store.database.engine import open_read_only
 from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
-from service.store.files.artefacts import ArtefactFiles, read_artefacts
 from service.store.records import Artefact
-from service.store.run_rows import read_runs, resolve_run
+from service.store.runs import read_runs, resolve_run
 
 
 class RecordedFiles:

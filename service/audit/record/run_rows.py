@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
 
-from service.store.errors import UnknownRunError
-from service.store.records import SITE
+from service.store.records import SITE, UnknownRunError
 
 PAGE = 50  # events or artefacts on one page
 LARGEST_SEQ = 2**53

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from service.audit.record.run import RecordedFiles
 from service.core.records.events import ArtefactRef
-from service.store.files.artefacts import hash_file
+from service.store.artefacts import hash_file
 
 
 class ScratchStore:

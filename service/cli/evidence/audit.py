@@ -40,7 +40,7 @@ from service.core.units import megabytes
 from service.store.access import kept_to
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
-from service.store.run_rows import resolve_run
+from service.store.runs import resolve_run
 from service.store.signatures.signing import PublicKey, checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification import verify as audit

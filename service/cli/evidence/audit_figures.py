@@ -21,7 +21,7 @@ from service.cli.common import (
 )
 from service.core.errors import ConfigurationError
 from service.core.text.counts import counted
-from service.store.run_rows import resolve_run
+from service.store.runs import resolve_run
 from service.store.verification import verify as audit
 
 

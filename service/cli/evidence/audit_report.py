@@ -26,7 +26,7 @@ from service.cli.common import (
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.store.database.engine import database_path
-from service.store.run_rows import resolve_run
+from service.store.runs import resolve_run
 from service.store.store import Store
 from service.store.verification import verify as audit
 

@@ -18,7 +18,7 @@ from service.cli.common import (
 from service.cli.evidence.store_backup import backup_command, restore_command
 from service.cli.evidence.store_rebuild import rebuild_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
-from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
+from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

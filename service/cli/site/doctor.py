@@ -37,8 +37,8 @@ from service.run_start import signature_copy
 from service.station import Station
 from service.steps import params_models
 from service.store.database.engine import database_path
+from service.store.disk_space import forecast_of
 from service.store.durable_effects import DurableFiles, SystemClock
-from service.store.files.space_used import forecast_of
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 

@@ -12,8 +12,8 @@ from typing import IO, Literal, NamedTuple
 
 from service.core.errors import ConfigurationError, DataError
 from service.dataset.package.listed import ListedFile
+from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
-from service.store.files.artefacts import hash_file
 
 _PART = ".part"  # ends the name of an unfinished file or folder
 _ABOUT = ".export"  # ends the name of the file beside it that says what is being written, and locks it

@@ -19,7 +19,7 @@ from service.audit.record import run_rows
 from service.audit.record.run_rows import RunBasics
 from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 from service.web.site import CurrentSite, Site
 
 _LOCK = Lock()

@@ -19,7 +19,7 @@ from service.core.records.events import RunStarted
 from service.core.run.connections import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
-from service.store.files.space_used import forecast_of
+from service.store.disk_space import forecast_of
 from service.store.records import RunRow
 from service.web.page.rendering import render
 from service.web.page.robot_banner import robot_banner

@@ -13,7 +13,7 @@ from service.core.equipment.clocks import clock_readings
 from service.core.equipment.disk_space import Forecast
 from service.core.errors import StoreError
 from service.monitor.figures import read_figures, read_health
-from service.store.files.space_used import forecast_of
+from service.store.disk_space import forecast_of
 from service.web.monitoring.metrics import DataFolderMetrics
 from service.web.monitoring.request_counts import RequestCounts
 from service.web.security.guards import Guard

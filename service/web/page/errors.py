@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 
 from service.core.errors import ConfigurationError, DataError, IntegrityError, OrthocaptureError, ProtocolError
 from service.people import person as people
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 from service.web.page.rendering import render
 from service.web.security.guards import token_of
 from service.web.security.shield import add_safety_headers

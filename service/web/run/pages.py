@@ -26,8 +26,8 @@ from service.people.person import Account, Person
 from service.rig import SigningSection
 from service.run_record import RunRecord, open_jobs, results_to_come
 from service.steps import step_kinds
+from service.store.disk_space import forecast_of
 from service.store.durable_effects import utc_text
-from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.recorded_rig import rig_cameras

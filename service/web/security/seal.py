@@ -9,8 +9,7 @@ from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 
 from service.core.errors import OrthocaptureError
-from service.store.errors import UnknownRunError
-from service.store.records import SITE
+from service.store.records import SITE, UnknownRunError
 from service.store.signatures.signing import checkpoint
 from service.web.site import CurrentSite, Site
 

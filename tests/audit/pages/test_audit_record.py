@@ -23,7 +23,7 @@ from service.core.records.events import StepNote
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.run_start import recorded_run
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until

@@ -1,26 +1,116 @@
-"""Leases: one runner per run. A process on this host holds its lease as long as it lives, others for a limited time.
-
-A runner alive on this host never loses its run to a timeout: the clock may be set, a wait may be long, and a process
-stopped by SIGSTOP would go on moving the arm when it is continued.
-"""
+"""Keeps the rows of runs and their leases: each run has one runner, which holds it while that lives."""
 
 from __future__ import annotations
 
 import logging
 import socket
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Literal, Self
 
 import psutil
-from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, case, delete, func, insert, select, update
 
 from service.core.errors import StoreError
+from service.core.records.events import RunStarted, SiteOpened
+from service.store.artefacts import ArtefactFiles, insert_artefacts
 from service.store.database.engine import Database
-from service.store.database.tables import leases
+from service.store.database.tables import event_index, events, heads, leases, runs
 from service.store.durable_effects import Clock, IdSource, SystemClock
-from service.store.errors import LeaseHeldError, LeaseLostError
+from service.store.events import ROOT, append
+from service.store.records import SITE, LeaseHeldError, LeaseLostError, NewArtefact, RunRow, UnknownRunError
+
+_ENDS = ("run_completed", "run_aborted")
+
+
+def begin_chain(
+    connection: Connection,
+    clock: Clock,
+    folder: ArtefactFiles,
+    run_id: str,
+    payload: RunStarted | SiteOpened,
+    actor: str,
+    artefacts: Sequence[NewArtefact],
+) -> None:
+    """Insert the row of a run, or of the site, with the first event of its chain and the artefacts of that event."""
+    # The run's row holds the hash of the root event, which refers to the row; keys are checked at commit.
+    connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
+    connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
+    (root,) = append(connection, clock, run_id, [payload], actor)
+    simulated = isinstance(payload, RunStarted) and payload.simulated
+    connection.execute(
+        insert(runs).values(
+            run_id=run_id,
+            created_utc=root.at_utc,
+            simulated=int(simulated),
+            root_sha256=root.sha256,
+        )
+    )
+    insert_artefacts(connection, folder, [root], artefacts)
+
+
+def read_runs(connection: Connection) -> list[RunRow]:
+    """All runs, oldest first, without the site's chain."""
+    statement = (
+        select(runs, heads.c.seq, heads.c.sha256)
+        .outerjoin(heads, heads.c.run_id == runs.c.run_id)
+        .where(runs.c.run_id != SITE)
+        .order_by(runs.c.created_utc, runs.c.run_id)
+    )
+    return [
+        RunRow(row.run_id, row.created_utc, bool(row.simulated), row.root_sha256, row.seq or 0, row.sha256 or ROOT)
+        for row in connection.execute(statement)
+    ]
+
+
+def read_open_runs(connection: Connection) -> set[str]:
+    """Runs that have neither an end recorded by the runner nor an operator's abort, which it confirms later."""
+    ended = (
+        select(event_index.c.seq)
+        .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
+        .exists()
+    )
+    aborted = (
+        select(events.c.seq)
+        .where(
+            events.c.run_id == heads.c.run_id,
+            events.c.seq == event_index.c.seq,
+            event_index.c.run_id == heads.c.run_id,
+            event_index.c.kind == "operator_action",
+            # A damaged payload must not raise here; the verification finds it.
+            case((func.json_valid(events.c.payload) == 1, func.json_extract(events.c.payload, "$.action")))
+            == "abort",
+        )
+        .correlate(heads)
+        .exists()
+    )
+    found = select(heads.c.run_id).where(heads.c.run_id != SITE, ~ended, ~aborted)
+    return set(connection.execute(found).scalars())
+
+
+def resolve_run(known: Sequence[RunRow], name: str) -> str:
+    """The run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+    if not known:
+        raise UnknownRunError("there is no run in this data folder yet", remedy="Start one with `orthocapture run`")
+    if name == "latest":
+        return known[-1].run_id
+    matches = [run.run_id for run in known if run.run_id == name] or [
+        run.run_id for run in known if name and run.run_id.startswith(name)
+    ]
+    if len(matches) != 1:
+        newest = ", ".join(run.run_id for run in known[-3:])
+        what = f"no run is called {name!r}" if not matches else f"{name!r} is the beginning of {len(matches)} runs"
+        raise UnknownRunError(what, remedy=f"The newest are: {newest}; or say `latest`")
+    return matches[0]
+
+
+# Leases: one runner per run. A process on this host holds its lease as long as it lives, others for a limited time.
+#
+# A runner alive on this host never loses its run to a timeout: the clock may be set, a wait may be long, and a
+# process stopped by SIGSTOP would go on moving the arm when it is continued.
+
 
 _SAME_START_S = 1.5  # the boot time is known to one second
 _HELD = select(leases.c.run_id).where(leases.c.token == bindparam("held"))  # put together once: every record asks it

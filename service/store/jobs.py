@@ -14,10 +14,9 @@ from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinish
 from service.core.shown_text import storable
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
-from service.store.errors import LeaseLostError
 from service.store.events import append, canonical, parse_canonical
-from service.store.queue.leases import ProcessIdentity, identity_of, identity_values
-from service.store.records import Job, NewJob
+from service.store.records import Job, LeaseLostError, NewJob
+from service.store.runs import ProcessIdentity, identity_of, identity_values
 
 ACTOR = "store"  # actor of events about a worker that is gone
 CANCELLED = "JobCancelled"  # as the error of a job that a person has cancelled
