@@ -118,7 +118,7 @@ def arguments(folder: Path, name: str) -> dict[str, Any]:
 def score(folder: Path) -> JobAnswer:
     """Score a mesh against the fused one as a benchmark does: the same with noise."""
     from service.benchmark.scoring import score_mesh, write_scored  # noqa: PLC0415 - loads much that jobs do not need
-    from service.dataset.posed.records import Mesh  # noqa: PLC0415
+    from service.dataset.records import Mesh  # noqa: PLC0415
 
     columns, faces = read_ply(folder / "ground_truth.ply")
     vertices = 1e-3 * np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)

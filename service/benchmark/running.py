@@ -27,9 +27,9 @@ from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_folder import scaled_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exported import scaled_data_set
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import DataSet
 from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
 

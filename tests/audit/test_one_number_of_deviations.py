@@ -20,8 +20,8 @@ from service.cli.main import app
 from service.core.run.fold import fold
 from service.core.run.state import Deviation
 from service.core.text.counts import counted
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.run_data_set import data_set_of
 from service.run_start import recorded_run
 from service.store.verification.verify import verify
 from tests.support.pages.browsed_run import words

@@ -12,7 +12,7 @@ from bench.reconstruction.specimen import score_specimen, specimen_of
 from service.compute.ground_truth.fusion.cut_out import Markers
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
-from service.dataset.posed.records import Mesh
+from service.dataset.records import Mesh
 
 CENTRE_M = np.array([0.0, 0.0, 0.03])
 UP = np.array([0.0, 0.0, 1.0])

@@ -28,7 +28,7 @@ from service.compute.matching.methods.method import matchers
 from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import load_protocol
 from service.core.run.decide import AskOperator
-from service.dataset.posed.exporter import exporters
+from service.dataset.exporter import exporters
 from service.jobs.words import term
 from service.steps import params_models
 from service.steps.capture.live_numbers import seen_words

@@ -41,8 +41,7 @@ from service.core.records.events import (
     StepStarted,
 )
 from service.core.run.fold import fold
-from service.dataset.late_results import late_results
-from service.dataset.registrations import shared_adjustment_note
+from service.dataset.registrations import late_results, shared_adjustment_note
 from service.rig import load_rig
 from service.run_record import RunRecord, read_log
 from service.run_start import start_run

@@ -19,8 +19,8 @@ from service.cli.common import console
 from service.cli.main import app
 from service.core.gates.verdict import describe, describe_judged, figure, quantity, standing
 from service.core.records.events import GateVerdict, Uncertainty
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.run_data_set import data_set_of
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import WebSite, web_site

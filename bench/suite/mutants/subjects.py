@@ -23,11 +23,10 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
         "service/compute/poses/hybrid/stated_covariance.py",
         "service/compute/poses/files/pose_covariance.py",
         "service/compute/calibration/intrinsics/uncertainty.py",
-        "service/dataset/posed/of_run/pose_errors.py",
-        "service/dataset/posed/of_run/view_covariances.py",
+        "service/dataset/view_covariances.py",
         "service/core/geometry.py",
     ),
-    "exporters": ("service/dataset/formats/**/*.py", "service/dataset/posed/exporter.py"),
+    "exporters": ("service/dataset/formats/**/*.py", "service/dataset/exporter.py"),
     "fusion": (
         "service/compute/ground_truth/fusion/*.py",
         "service/compute/ground_truth/align.py",

@@ -22,15 +22,7 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.core.records.import_list import imported_sentence
-from service.dataset.package.crate_entities import (
-    CONTEXT,
-    anchor,
-    descriptor,
-    device,
-    file_entity,
-    person,
-    software,
-)
+from service.dataset.crate import CONTEXT, anchor, descriptor, device, file_entity, person, software
 from service.store.events import canonical, references
 from service.store.records import Artefact
 

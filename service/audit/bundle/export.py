@@ -18,7 +18,7 @@ from service.core.gates.release import refuse_export
 from service.core.protocol.models import Protocol
 from service.core.records.events import EvidenceExported, RunStarted
 from service.core.run.fold import fold
-from service.dataset.package.crate_entities import METADATA
+from service.dataset.crate import METADATA
 from service.run_start import recorded_run
 from service.store.artefacts import hash_file
 from service.store.disk_space import require_export_space

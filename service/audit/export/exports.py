@@ -23,7 +23,7 @@ from service.audit.export.wanted import (
 )
 from service.core.errors import DataError, IllegalTransitionError
 from service.core.records.events import Event, EvidenceExported
-from service.dataset.posed.folder import SUMS
+from service.dataset.export_folder import SUMS
 from service.store.durable_effects import Clock, utc_text
 
 FOLDER = "exports"

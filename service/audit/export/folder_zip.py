@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from service.core.errors import IntegrityError
-from service.dataset.posed.folder import SUMS
+from service.dataset.export_folder import SUMS
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

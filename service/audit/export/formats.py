@@ -43,7 +43,7 @@ class Formats:
 
 def listed(_progress: Progress) -> list[dict[str, str]]:
     """The formats as plain data. Raises ConfigurationError."""
-    from service.dataset.posed.exporter import exporters  # noqa: PLC0415 - see above
+    from service.dataset.exporter import exporters  # noqa: PLC0415 - see above
 
     return [{"name": name, "words": how.words} for name, how in sorted(exporters().items())]
 

@@ -14,10 +14,10 @@ from service.audit.record.run import read_run
 from service.core.errors import ConfigurationError
 from service.core.gates.release import refuse_data_set
 from service.core.records.data_set import VERSION
-from service.dataset.posed.exporter import Exporter, exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
-from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exporter import Exporter, exporter, write_data_set
+from service.dataset.pixels import cropped_data_set, undistorted_data_set
+from service.dataset.records import DataSet
+from service.dataset.run_data_set import data_set_of, specimen_pixels
 from service.dataset.summary import RunSummary
 from service.store.disk_space import require_export_space
 from service.store.store import Store

@@ -85,8 +85,8 @@ def _in_format(store: Store, run_id: str, target: Path, actor: str, progress: Pr
 
 def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
     from service.audit.record.missing_results import not_in_yet  # noqa: PLC0415
-    from service.dataset.posed.exporter import exporter, write_data_set  # noqa: PLC0415
-    from service.dataset.posed.of_run.data_set import data_set_of  # noqa: PLC0415
+    from service.dataset.exporter import exporter, write_data_set  # noqa: PLC0415
+    from service.dataset.run_data_set import data_set_of  # noqa: PLC0415
 
     missing = not_in_yet(run.protocol, run.state, run.events)
     write_data_set(data_set_of(run.summary(), missing), exporter("plain"), folder)

@@ -43,7 +43,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, inverse
 from service.core.protocol.models import LoadedProtocol, load_protocol
 from service.core.units import mm
-from service.dataset.posed.folder import check_folder
+from service.dataset.export_folder import check_folder
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary, summarise
 from service.jobs.registration.evaluate import Row

@@ -19,9 +19,9 @@ from service.compute.matching.pairs.covisibility import LEAST_OVERLAP, Covisibil
 from service.compute.matching.pairs.listed import ListedPair, listed_pairs
 from service.compute.matching.pairs.loader import View as GroundTruth
 from service.core.units import mm, mrad
-from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.export_folder import ExportFolder, Part
+from service.dataset.exporter import Exporter
+from service.dataset.records import DataSet, PosedView
 
 _POINTS = 20_000  # of the surface, by which overlap is measured: to within half a per cent
 _SEED = 14

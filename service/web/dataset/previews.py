@@ -10,7 +10,7 @@ from fastapi import Depends, Request
 
 from service.audit.background.child_process import ChildProcesses, ChildState
 from service.core.run.state import RunState
-from service.dataset.preview.records import FILE_NAME, Preview, read_preview
+from service.dataset.preview_records import FILE_NAME, Preview, read_preview
 from service.store.durable_effects import Clock
 from service.web.site import CurrentSite
 

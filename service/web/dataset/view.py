@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.dataset.preview.records import AT_LEAST, Preview, ViewPreview
+from service.dataset.preview_records import AT_LEAST, Preview, ViewPreview
 
 SPLITS = ("dense", "sparse", "train", "test")
 SPLIT_WORDS = {

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.protocol.step_params import Gives
-from service.dataset.control_spheres import control_centres
-from service.dataset.registered_scan import control_scan, registered_scan
 from service.dataset.registrations import best_registration, registrations
+from service.dataset.summary import control_centres, control_scan, registered_scan
 from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres

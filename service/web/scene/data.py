@@ -17,9 +17,9 @@ from service.core.records.events import ArtefactRef, RecordedView, ViewpointCapt
 from service.core.text.counts import counted
 from service.core.units import metres, mm
 from service.dataset.further_cameras import further_poses
-from service.dataset.registered_scan import registered_scan
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
+from service.dataset.summary import registered_scan
 from service.jobs.capture import further_view
 from service.jobs.records import Point
 from service.jobs.registration.register import Registration

@@ -24,7 +24,7 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import ArtefactRef
 from service.core.units import deg, metres, mm
-from service.dataset.posed.records import SIMULATED
+from service.dataset.records import SIMULATED
 from service.jobs.records import Point, SpheresFound, matrix
 from service.jobs.surfaces import fuse as job
 from service.worker.job import JobAnswer, JobContext

@@ -39,7 +39,7 @@ OF_PAGES = {
         "service.audit.report.output.pdf",
     ),
     "service.audit.verify.process": (),
-    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview.making"),
+    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview"),
 }
 VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
     "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",

@@ -23,7 +23,7 @@ from service.core.text.counts import counted
 from service.core.units import metres, mm
 from service.dataset import scene_view
 from service.dataset.further_cameras import further_poses
-from service.dataset.scene_shapes import frustum_lines, unit_ball
+from service.dataset.scene_view import frustum_lines, unit_ball
 from service.dataset.summary import RunSummary
 
 _FACES = 16_000

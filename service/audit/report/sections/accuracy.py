@@ -10,8 +10,7 @@ from service.audit.record.missing_results import not_in_yet
 from service.audit.report.blocks import Block, Column, Heading, Paragraph, Section, Table, TableCell
 from service.audit.report.words import mm, utc, words
 from service.core.gates.dependence import depends_on
-from service.dataset.late_results import late_results
-from service.dataset.registrations import shared_adjustment_note
+from service.dataset.registrations import late_results, shared_adjustment_note
 from service.dataset.summary import RunSummary
 from service.jobs.registration.evaluate import ErrorBudget, Row
 

@@ -12,7 +12,7 @@ from service.audit.report.sections.notes import about_facts
 from service.audit.report.words import duration, utc
 from service.core.errors import OrthocaptureError
 from service.core.records.events import SessionStarted
-from service.dataset.late_results import late_results
+from service.dataset.registrations import late_results
 from service.rig import parse_recorded_rig
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
 
-from service.dataset.posed.about import NOT_STATED, About
-from service.dataset.posed.records import DataSet
+from service.dataset.records import NOT_STATED, About, DataSet
 
 NAME = "DATACARD.md"
 BESIDE = {

@@ -7,13 +7,29 @@ import fcntl
 import json
 import shutil
 from collections.abc import Callable, Generator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
 from service.core.errors import ConfigurationError, DataError
-from service.dataset.package.listed import ListedFile
 from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
+
+
+@dataclass(frozen=True, slots=True)
+class ListedFile:
+    """A file.
+
+    Attributes:
+        path: relative to the folder, with `/`.
+        sha256: of its content.
+        size_bytes: of its content.
+    """
+
+    path: str
+    sha256: str
+    size_bytes: int
+
 
 _PART = ".part"  # ends the name of an unfinished file or folder
 _ABOUT = ".export"  # ends the name of the file beside it that says what is being written, and locks it

@@ -1,4 +1,4 @@
-"""The posed data set of a finished run, from its record."""
+"""Makes the posed data set of a finished run from its record, with the files of the registered scan."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import hashlib
 import json
 from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from drivers.meshes.companions import companion_names
+from drivers.meshes.foreign_text import alike
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import WorldSphere, hull_mask
 from service.compute.pixels.ray_mesh import RayMesh
@@ -20,18 +22,14 @@ from service.core.geometry import Array, apply, inverse
 from service.core.picture_files import PNG_BEGINS
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.units import metres
-from service.dataset.control_spheres import control_centres
-from service.dataset.posed.of_run.about_run import about_run
-from service.dataset.posed.of_run.further_views import FurtherView, further_views
-from service.dataset.posed.of_run.posts import posts_of
-from service.dataset.posed.of_run.scan_files import scan_files
-from service.dataset.posed.of_run.statement import described_run
-from service.dataset.posed.of_run.view_covariances import view_covariances
-from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, PosedView
-from service.dataset.registered_scan import control_scan
+from service.dataset.about_run import about_run, described_run
+from service.dataset.further_views import FurtherView, further_views
+from service.dataset.pixels import Photographs
+from service.dataset.posts import posts_of
+from service.dataset.records import DataSet, Mesh, PosedView, ScanFile
 from service.dataset.registrations import result_of_step
-from service.dataset.summary import RunSummary
+from service.dataset.summary import RunSummary, control_centres, control_scan, registered_scan
+from service.dataset.view_covariances import view_covariances
 from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 
@@ -213,3 +211,29 @@ def _sees(view: PosedView, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[n
 def _identity(summary: RunSummary, own: str, registered: Registration, hashes: dict[str, str]) -> str:
     inputs = json.dumps([own, registered.model_dump(mode="json"), hashes], sort_keys=True)
     return f"{summary.run_id} {hashlib.sha256(inputs.encode()).hexdigest()}"
+
+
+_MOST_BYTES = 1 << 20  # of a mesh, which names its companions in its first lines, and of a material
+_REFERRING = (".obj", ".mtl", ".ply")
+
+
+def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
+    """The original files of the registered scan, under the names by which they refer to each other.
+
+    Recorded files have lost their folders and may differ in case; a mesh finds its materials, and these find their
+    textures, only under the names that are written in them.
+    """
+    step = registered_scan(summary.protocol, summary.state)
+    kept = summary.state.steps[step].artefacts if step else ()
+    refs = [ref for ref in kept if ref.kind == "scan_mesh_original"]
+    named: dict[str, str] = {}  # by the last part of the name, in lower case and with accents composed
+    for ref in refs:
+        if ref.original_name.lower().endswith(_REFERRING):
+            with summary.store.artefact_path(ref.sha256).open("rb") as file:
+                content = file.read(_MOST_BYTES)
+            for name in companion_names(content):
+                named.setdefault(alike(PurePosixPath(name).name), name)
+    return tuple(
+        ScanFile(named.get(alike(ref.original_name), ref.original_name), summary.store.artefact_path(ref.sha256))
+        for ref in refs
+    )

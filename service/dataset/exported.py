@@ -17,9 +17,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.pixels.splits import Splits
 from service.core.errors import DataError
 from service.core.text.json_text import parse_json
+from service.dataset.export_folder import SUMS, check_folder
 from service.dataset.formats.meshes import png
-from service.dataset.posed.folder import SUMS, check_folder
-from service.dataset.posed.records import DataSet, Mesh, PosedView
+from service.dataset.records import DataSet, Mesh, PosedView
 
 INDEX = "data.h5"
 _REMEDY = "Export it again with --format hdf5"

@@ -11,7 +11,7 @@ import numpy as np
 from service.compute.pixels.masks import Cylinder, WorldSphere, posts_below
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, apply, inverse
-from service.dataset.posed.records import Mesh, PosedView
+from service.dataset.records import Mesh, PosedView
 from service.dataset.summary import RunSummary
 from service.jobs.registration.register import ARM
 from service.rig import RigSection, parse_recorded_rig

@@ -20,7 +20,7 @@ from service.compute.pixels.render import depth_map, seen
 from service.compute.pixels.splits import Splits
 from service.compute.pixels.undistort import pinhole_of, undistorted, valid_pixels
 from service.core.errors import DataError
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.records import DataSet, PosedView
 
 _T = TypeVar("_T")
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)

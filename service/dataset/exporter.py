@@ -1,4 +1,4 @@
-"""The declaration of an export format, and how a data set is written in one."""
+"""Declares export formats, and writes a data set in one of them with what every exported folder has beside it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.core.declared_kinds import declared_kinds, kind_named
-from service.dataset.package.packaging import write_package
-from service.dataset.posed.folder import ExportFolder, count_files, export_folder
-from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset import card, croissant
+from service.dataset.crate import METADATA, crate
+from service.dataset.croissant import VIEWS_NAME, views_csv
+from service.dataset.export_folder import ExportFolder, count_files, export_folder, json_bytes
+from service.dataset.pixels import undistorted_data_set
+from service.dataset.records import DataSet
 
 GROUP = "orthocapture.exporters"
 Progress = Callable[[str, int, int], None]  # activity, files done, files in total
@@ -95,3 +97,33 @@ def _told(dataset: DataSet, how: Exporter, progress: Progress | None) -> Callabl
         return lambda _count: None
     total = count_files(lambda folder: _write(dataset, how, folder))
     return lambda count: progress("writing", count, total)
+
+
+_DESCRIBED = {
+    **card.BESIDE,
+    card.NAME: "what this data set is, how it was made, how good it is, and what may be done with it",
+}
+
+
+def write_package(dataset: DataSet, folder: ExportFolder, *, form: str, words: str, description: str) -> None:
+    """dataset.json, splits.json, views.csv, the data card, Croissant and RO-Crate; the format's files come before.
+
+    They are written again when an interrupted export goes on, because they depend on the whole record.
+
+    Args:
+        dataset: as the format got it.
+        folder: with the files of the format.
+        form: the format's name.
+        words: the format in a few words.
+        description: the docstring of its writer, which explains its files.
+    """
+    about = {"format": form, "version": dataset.about.version, "simulated": dataset.simulated}
+    folder.anew("dataset.json", lambda: json_bytes({**dataset.statement, **about}))
+    folder.anew("splits.json", lambda: json_bytes({"simulated": dataset.simulated, **dataset.splits.named()}))
+    folder.anew(VIEWS_NAME, lambda: views_csv(dataset, folder.parts))
+    folder.anew(card.NAME, lambda: card.card(dataset, words, description).encode())
+    folder.anew(
+        croissant.NAME,
+        lambda: json_bytes(croissant.croissant(dataset, words, folder.listed(), folder.parts, _DESCRIBED)),
+    )
+    folder.anew(METADATA, lambda: json_bytes(crate(dataset, words, folder.listed(), _DESCRIBED)))

@@ -1,4 +1,4 @@
-"""Coloured surfaces of a data set: how many views see it, what it comes from, how far the scan is from the CT."""
+"""Makes the coloured surfaces of a preview: how many views see it, what it comes from, how far scan and CT differ."""
 
 from __future__ import annotations
 
@@ -13,20 +13,88 @@ from service.compute.ground_truth.distances.chamfer import ChamferSettings, cham
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import sample
+from service.compute.ground_truth.fusion.fuse import Source
+from service.compute.ground_truth.ply import read_ply
 from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.coverage import covered_shares
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.units import metres, mm
-from service.dataset.posed.records import DataSet, Mesh
-from service.dataset.preview.fusion import PICTURE, shown_ground_truth, vertex_figures
-from service.dataset.preview.records import AT_LEAST, CoveragePreview, DistancePreview, GroundTruthPreview, put
-from service.dataset.recorded_fusion import MESH, RecordedFusion
+from service.dataset.preview_records import (
+    AT_LEAST,
+    CoveragePreview,
+    DecidedRegion,
+    DistancePreview,
+    GroundTruthPreview,
+    put,
+)
+from service.dataset.records import DataSet, Mesh
 from service.dataset.registrations import last_result
 from service.dataset.scene_view import MeshColours, Scene, SceneMesh, SceneSphere, decimated, scene_json
-from service.dataset.summary import RunSummary
+from service.dataset.summary import MESH, RecordedFusion, RunSummary
 from service.jobs.records import SpheresFound
+
+PICTURE = "fusion_picture"  # kind of its artefact
+_HIGH = 99.0  # percentile of the sigmas at the end of the colours
+#: What a vertex can come from, in the order of the colours; the names and colours of the fusion's picture.
+_PARTS = ((Source.CT, "CT", "#d65e00"), (Source.BLEND, "blend", "#f0e442"), (Source.SCAN, "scan", "#0072b2"))
+
+
+@dataclass(frozen=True, slots=True)
+class VertexFigures:
+    """Colours of points on the mesh, for their source and for their standard deviation."""
+
+    sources: MeshColours
+    sigmas: MeshColours
+
+
+def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_high_mm: float) -> GroundTruthPreview:
+    """The figures of a fusion as it was recorded, with the names of the files of its two coloured meshes."""
+    measures = fusion.measures
+    return GroundTruthPreview(
+        step=fusion.step,
+        ct_share=measures["ct_share"],
+        scan_share=measures["scan_share"],
+        blend_share=measures["blend_share"],
+        sigma_median_mm=measures["sigma_median_mm"],
+        sigma_high_mm=sigma_high_mm,
+        distance_change_max_mm=measures["sphere_distance_change_max_mm"],
+        loop_closure_mm=measures.get("loop_closure_mm"),
+        faces=int(measures["ground_truth_faces"]),
+        regions=tuple(DecidedRegion(region.source, region.by) for region in fusion.answer.regions),
+        sources=sources,
+        sigmas=sigmas,
+    )
+
+
+def vertex_figures(path: Path, points_m: Array) -> tuple[VertexFigures, float]:
+    """Source and sigma at points (V, 3) of the mesh, each that of the nearest vertex; and a high sigma, in mm.
+
+    Args:
+        path: of the recorded mesh, a PLY in millimetres with `source` and `sigma_mm` at each vertex.
+        points_m: of a simplified mesh in the same frame.
+
+    Raises:
+        DataError: it has no such properties.
+    """
+    columns, _ = read_ply(path)
+    if not {"source", "sigma_mm"} <= set(columns):
+        raise DataError("the ground truth's mesh has neither source nor sigma", where=path.name)
+    vertices_m = metres(np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1))
+    _, nearest = PointIndex(vertices_m).nearest(points_m)
+    sigma_mm = columns["sigma_mm"].astype(np.float64)
+    high_mm = float(np.percentile(sigma_mm, _HIGH))
+    places = np.zeros(len(Source))
+    for place, (source, _, _) in enumerate(_PARTS):
+        places[source] = place
+    values = places[columns["source"].astype(np.int64)][nearest]
+    classes = tuple((name, colour) for _, name, colour in _PARTS)
+    return VertexFigures(
+        MeshColours(values, "source", "", classes),
+        MeshColours(np.minimum(sigma_mm[nearest], high_mm), "stated sigma (mm)", "%{intensity:.3f} mm"),
+    ), high_mm
+
 
 _SPACING_M = 5e-4  # coarser than the paper's 0.1 mm: it is for looking
 _SAMPLES = 3_000_000  # of each surface at most; a larger one is sampled more coarsely
