@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
-from service.cli.run.demo import true_cameras
+from service.cli.demo import true_cameras
 from service.compute.camera_model import CameraModel
 from service.compute.pipeline import register_images
 from service.compute.registration.camera_errors import camera_errors

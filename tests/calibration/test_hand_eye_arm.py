@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bench.calibration.arm_errors import one as hand_eye_of
 from bench.calibration.arm_errors import seen_from_nominal_flange
-from service.cli.calibrate.group import calibrate_app
+from service.cli.calibrate import calibrate_app
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import (

@@ -41,7 +41,7 @@ except SystemExit as end:
 AT_READY = """
 import json, sys
 from service.cli.main import main
-from service.cli.site import serve
+from service.cli import serve
 def ready(*_address, **_how):
     raise SystemExit
 serve._announce = ready

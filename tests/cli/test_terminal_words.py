@@ -19,10 +19,9 @@ from typer.testing import CliRunner
 
 from service.benchmark.methods import methods
 from service.cli.common import print_table
+from service.cli.demo import free_address
 from service.cli.main import app
-from service.cli.run.demo import free_address
-from service.cli.run.terminal.hands import SimulatedHands
-from service.cli.run.terminal.operators import Display, TerminalOperator
+from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.compute.matching.methods.method import matchers
 from service.core.protocol.irreversible import irreversible_warning

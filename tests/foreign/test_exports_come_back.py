@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.compute.import_ros import keep_image
+from service.cli.import_ros import keep_image
 from service.cli.main import app
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.poses.files.pose_files import read_poses

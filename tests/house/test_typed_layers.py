@@ -56,12 +56,12 @@ EDGES = {
     "service/compute/poses/sfm/model/adjustment.py": "messages of a child process",
     "service/compute/poses/sfm/model/mapping.py": "messages of a child process",
     # JSON that commands print
-    "service/cli/compute/evaluate_chamfer.py": "prints JSON",
-    "service/cli/compute/fuse.py": "prints JSON",
-    "service/cli/evidence/audit.py": "prints JSON",
-    "service/cli/evidence/replay.py": "prints JSON",
-    "service/cli/run/status.py": "prints JSON",
-    "service/cli/run/import_command.py": "prints JSON",
+    "service/cli/evaluate.py": "prints JSON",
+    "service/cli/fuse.py": "prints JSON",
+    "service/cli/audit.py": "prints JSON",
+    "service/cli/replay.py": "prints JSON",
+    "service/cli/status.py": "prints JSON",
+    "service/cli/import_command.py": "prints JSON",
 }
 
 

@@ -14,8 +14,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from service.cli.demo import true_error_mm
 from service.cli.main import app
-from service.cli.run.demo import true_error_mm
 from service.core.errors import DataError
 from service.core.protocol.models import load_protocol
 from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured

@@ -25,8 +25,8 @@ from service.audit.bundle.report import bundle_report
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest, digests
 from service.audit.verify.bundle_verifier import main as verify_bundle
-from service.cli.run.terminal.operators import Display
-from service.cli.run.terminal.waiting import wait_for_results
+from service.cli.operators import Display
+from service.cli.run import wait_for_results
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs.priorities import LATER
 from service.core.protocol.models import Protocol, parse_protocol

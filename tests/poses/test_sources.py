@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from service.cli.run.status import status_record
+from service.cli.status import status_record
 from service.core.geometry import look_at
 from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol

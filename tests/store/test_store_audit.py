@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.evidence.audit import audit_app
+from service.cli.audit import audit_app
 from service.core.errors import OrthocaptureError, StoreError
 from service.core.records.events import StepNote
 from service.store.database.engine import database_path

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.evidence.audit import audit_app
+from service.cli.audit import audit_app
 from service.core.errors import IntegrityError
 from service.core.records.events import SignInRecorded
 from service.store.records import SITE, SigningKeyError, UnknownRunError
