@@ -100,7 +100,7 @@ def correct_command(
     json: JsonOption = False,
 ) -> None:
     """Correct a recorded value. The original stays, and readers see both, with who, when and why."""
-    from service.audit.overview.corrections import correct  # noqa: PLC0415 - `verify` does not need the overview
+    from service.audit.overview.findings import correct  # noqa: PLC0415 - `verify` does not need the overview
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
@@ -274,8 +274,7 @@ def export_command(
     It is refused if the evidence does not verify, or if a release that the protocol requires is missing.
     """
     # Imported here because they load the numerics, which `verify` does not need.
-    from service.audit.bundle.export import export_bundle  # noqa: PLC0415
-    from service.audit.bundle.report import bundle_report  # noqa: PLC0415
+    from service.audit.bundle.export import bundle_report, export_bundle  # noqa: PLC0415
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)

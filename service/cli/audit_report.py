@@ -68,8 +68,7 @@ def report_command(
             # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
             from service.audit.report.content import report_content  # noqa: PLC0415
-            from service.audit.report.output.html import write_html  # noqa: PLC0415
-            from service.audit.report.output.pdf import write_pdf  # noqa: PLC0415
+            from service.audit.report.output import write_html, write_pdf  # noqa: PLC0415
 
             progress("writing the report", 0, 1)
             report = report_content(read_run(data, run_id), verified, with_scene=html is not None)
@@ -157,7 +156,7 @@ def figures_command(
             # The numerics take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
             from service.audit.report.content import report_content  # noqa: PLC0415
-            from service.audit.report.output.figures import figure_files, write_figures  # noqa: PLC0415
+            from service.audit.report.output import figure_files, write_figures  # noqa: PLC0415
 
             progress("drawing the figures", 0, 1)
             recorded = read_run(data, run_id)

@@ -24,7 +24,7 @@ from service.audit.export.posed import export_data_set
 from service.audit.export.wanted import WantedExport
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import write_html
+from service.audit.report.output import write_html
 from service.cli.common import (
     JsonOption,
     console,

@@ -13,8 +13,7 @@ from rich.table import Table
 
 from service.audit.record.run import read_run
 from service.audit.replay.differences import Difference
-from service.audit.replay.replay import DEFAULT_KINDS, replay
-from service.audit.replay.results import JobReplay, ReplayReport
+from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, ReplayReport, replay
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.ply import read_ply
-from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply
 from service.core.protocol.models import Protocol
@@ -217,6 +216,8 @@ def control_centres(scan: tuple[Point, ...], control: tuple[Point, ...]) -> tupl
     """Centres that only the control scan shows, in the frame of the scan."""
     if not scan or not control:
         return ()
+    from service.compute.surfaces.constellations import match_constellations  # noqa: PLC0415 - loads scipy
+
     a, b = np.array(scan), np.array(control)
     try:
         found = match_constellations(a, b)

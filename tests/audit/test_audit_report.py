@@ -19,8 +19,8 @@ from service.audit.bundle.export import export_bundle
 from service.audit.record.run import read_run
 from service.audit.report.blocks import Report
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
-from service.audit.report.sections.course import incidents
+from service.audit.report.course import incidents
+from service.audit.report.output import render_html
 from service.cli.main import app
 from service.core.errors import StoreError
 from service.core.records.events import (

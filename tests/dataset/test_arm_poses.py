@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import RecordedRun, read_run
-from service.audit.replay.scratch import ScratchStore
+from service.audit.replay.recomputed import ScratchStore
 from service.compute.matching.pairs.relative_pose import relative_covariance
 from service.core.run.state import JobState
 from service.dataset.run_data_set import data_set_of

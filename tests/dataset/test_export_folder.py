@@ -184,7 +184,7 @@ def test_an_image_is_decoded_once_for_all_its_crops(
         decoded.append(path)
         return read_image_of(path, camera)
 
-    monkeypatch.setattr("service.compute.images.files.read_image_of", counted)
+    monkeypatch.setattr("service.dataset.pixels.read_image_of", counted)
     whole = undistorted_data_set(dataset) if straight else dataset
     everywhere = cropped_data_set(
         whole, lambda view: np.ones((view.camera.height, view.camera.width), bool), (40, 30), most=4

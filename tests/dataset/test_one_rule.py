@@ -11,7 +11,7 @@ import pytest
 
 from service.audit.record.run import RecordedRun, read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
+from service.audit.report.output import render_html
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array
 from service.core.run.state import RunState

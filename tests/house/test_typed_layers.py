@@ -13,9 +13,8 @@ UNTYPED = re.compile(r"\b(dict|Mapping|MutableMapping)\[str, (Any|object)\]")
 # The modules in which JSON, rows of SQL or messages of a child process become records, or records become these.
 EDGES = {
     # recorded events and arguments of jobs, before their records are read and after they are written
-    "service/audit/overview/corrections.py": "a correction names any field of any recorded event",
     "service/audit/overview/findings.py": "a correction names any field of any recorded event",
-    "service/audit/record/event_rows.py": "shows recorded events even where they are altered and no longer records",
+    "service/audit/record/rows.py": "shows recorded events even where they are altered and no longer records",
     "service/audit/replay/recomputed.py": "arguments of a job with recomputed answers, before its kind reads them",
     "service/core/jobs/keys.py": "hashes recorded arguments of any kind of job",
     "service/core/jobs/references.py": "references as they stand in recorded arguments",

@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 import pytest
 
-from service.audit.background.incremental import Progress
-from service.audit.bundle.export import export_bundle
-from service.audit.bundle.report import bundle_report
+from service.audit.background import PartialProgress
+from service.audit.bundle.export import bundle_report, export_bundle
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest, digests
 from service.audit.verify.bundle_verifier import main as verify_bundle
@@ -124,7 +123,7 @@ class Run:
         computed = digests(self.store)
         digest = computed.get(self.run_id, wait_s=60.0)
         computed.close()
-        assert not isinstance(digest, Progress)
+        assert not isinstance(digest, PartialProgress)
         return digest
 
 

@@ -21,7 +21,7 @@ import trimesh
 import yaml
 
 from service.audit.record.run import read_run
-from service.audit.replay.copied import CopiedResults
+from service.audit.replay.recomputed import CopiedResults
 from service.cli.demo import free_address
 from service.core.jobs.references import jobs_of, references_in
 from tests.support.processes.package import Package, installed_package

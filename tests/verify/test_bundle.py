@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import export_bundle
-from service.audit.bundle.report import bundle_report
+from service.audit.bundle.export import bundle_report, export_bundle
 from service.audit.verify import bundle_verifier
 from service.cli.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError

@@ -10,7 +10,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from service.audit.overview.corrections import correct
+from service.audit.overview.findings import correct
 from service.audit.record.starts import record_start
 from service.core.errors import DataError
 from service.core.records.events import EvidenceExported, OperatorAction, RunAborted, RunReleased

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from service.audit.bundle.contents import BundledRun
-from service.audit.bundle.zip_file import ManifestEntry
+from service.audit.bundle.contents import BundledRun, ManifestEntry
 from service.core.equipment.camera_bodies import bodies
 from service.core.equipment.recorded_devices import recorded_report
 from service.core.gates.acceptance import describe_accepted

@@ -6,11 +6,10 @@ import re
 from functools import partial
 from pathlib import Path
 
-from service.audit.background.child_process import Progress
+from service.audit.background import Progress
 from service.audit.bundle.export import record_export, require_exportable
 from service.audit.export.wanted import WantedExport
-from service.audit.record.missing_results import not_in_yet
-from service.audit.record.run import read_run
+from service.audit.record.run import not_in_yet, read_run
 from service.core.errors import ConfigurationError
 from service.core.gates.release import refuse_data_set
 from service.core.records.data_set import VERSION

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
 
-from service.audit.record.event_rows import EventRow, read_rows
-from service.audit.record.run_rows import plain
+from service.audit.record.rows import EventRow, plain, read_rows
 from service.core.equipment.camera_bodies import CameraBodies, bodies_of
 from service.core.equipment.recorded_devices import RecordedReport, recorded_report
 from service.core.records.events import DeviceOpened, SessionStarted, ViewpointCaptured

@@ -7,10 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import findings, first_page
-from service.audit.overview.corrections import correct
-from service.audit.record import artefact_queries, event_rows, run_rows
+from service.audit.overview.findings import correct
+from service.audit.record import rows, search
 from service.web.audit.frame import CurrentAudit, audit_frame, link
 from service.web.page.rendering import render
 from service.web.run.forms import Reason
@@ -29,24 +29,22 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
     views = findings.replaced_viewpoints(known) if known else []
-    pages = max(1, -(-len(views) // run_rows.PAGE))
+    pages = max(1, -(-len(views) // rows.PAGE))
     page = min(max(page, 1), pages)
-    shown = views[(page - 1) * run_rows.PAGE : page * run_rows.PAGE]
+    shown = views[(page - 1) * rows.PAGE : page * rows.PAGE]
     with audit.site.store.database.reading() as connection:
         values = findings.corrected_values(connection, run_id)
         steps = findings.replaced_steps(connection, run_id, known) if known else []
         seqs = sorted({seq for view in shown for seq in (view.old_seq, view.new_seq) if seq})
         pictures = {
-            row.seq: row
-            for row in reversed(artefact_queries.artefacts_of_events(connection, run_id, seqs))
-            if row.is_picture
+            row.seq: row for row in reversed(search.artefacts_of_events(connection, run_id, seqs)) if row.is_picture
         }
-        corrected = event_rows.count_of_kind(connection, run_id, "record_corrected")
+        corrected = rows.count_of_kind(connection, run_id, "record_corrected")
     return render(
         request,
         "audit/corrections.html.j2",
         audit=frame,
-        progress=digest if isinstance(digest, Progress) else None,
+        progress=digest if isinstance(digest, PartialProgress) else None,
         values=values,
         corrected=corrected,
         steps=steps,

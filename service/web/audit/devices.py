@@ -7,7 +7,7 @@ from fastapi.responses import HTMLResponse, Response
 
 from service.audit.overview import findings
 from service.audit.overview.devices import bodies_of_run, clock_offsets, opened_devices, sessions
-from service.audit.record import event_rows
+from service.audit.record import rows
 from service.core.equipment.clocks import clock_offset_words, clock_readings
 from service.steps.notes import deidentified
 from service.web.audit.frame import CurrentAudit, audit_frame
@@ -31,7 +31,7 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
         opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         started = findings.events_of(connection, run_id, "session_started", newest=True)
         troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
-        trouble_count = event_rows.count_of_kind(connection, run_id, "device_trouble")
+        trouble_count = rows.count_of_kind(connection, run_id, "device_trouble")
         clocks = clock_offsets(connection, run_id)
         bodies = bodies_of_run(connection, run_id, opened)
     log = audit.site.run(run_id)

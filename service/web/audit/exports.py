@@ -10,9 +10,7 @@ from fastapi import APIRouter, Depends, Form, Path, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
 from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
-from service.audit.export.exports import Exports, What
-from service.audit.export.folder_zip import zip_chunks
-from service.audit.export.formats import Formats
+from service.audit.export.exports import Exports, Formats, What, zip_chunks
 from service.audit.export.wanted import WantedExport
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates.release import refuse_data_set, refuse_export, refuse_release, release_meaning

@@ -10,13 +10,12 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, FastAPI, Request
 
-from service.audit.background.child_process import ChildState
-from service.audit.background.incremental import IncrementalResults
+from service.audit.background import ChildState, IncrementalResults
 from service.audit.overview.digest import Digest, digests
 from service.audit.overview.first_page import verified
-from service.audit.provenance.graph import Graph, graphs
-from service.audit.record import run_rows
-from service.audit.record.run_rows import RunBasics
+from service.audit.provenance import Graph, graphs
+from service.audit.record import rows
+from service.audit.record.rows import RunBasics
 from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
 from service.store.records import UnknownRunError
@@ -85,7 +84,7 @@ class AuditFrame:
 def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
     """The frame of one run's page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
-        found = run_rows.runs(connection, run_id)
+        found = rows.runs(connection, run_id)
     if not found:
         raise UnknownRunError(f"there is no run {run_id!r}", remedy="Choose one from the list of runs")
     base = f"/audit/runs/{run_id}"

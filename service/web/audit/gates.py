@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, Response
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest
 from service.core.protocol.models import Protocol
@@ -61,7 +61,7 @@ def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         request,
         "audit/gates.html.j2",
         audit=audit_frame(audit, run_id, "/gates"),
-        progress=digest if isinstance(digest, Progress) else None,
+        progress=digest if isinstance(digest, PartialProgress) else None,
         steps=gates_of(known) if known else [],
     )
 

@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING
 from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import findings, first_page
 from service.audit.overview.devices import bodies_of_run, opened_devices
-from service.audit.overview.digest import Digest
+from service.audit.overview.digest import Digest, failed_exposures_of, shots_of, together
 from service.audit.overview.first_page import DEVIATION_GROUPS, GROUPS, NOTE_GROUPS
-from service.audit.overview.shots import failed_exposures_of, shots_of, together
 from service.audit.overview.signatures import RecordedSignature
 from service.audit.overview.signatures import signatures as signatures_of
-from service.audit.record import event_rows, run_rows
-from service.audit.record.event_rows import EventRow
+from service.audit.record import rows
+from service.audit.record.rows import EventRow
 from service.core.equipment.camera_bodies import CameraBodies
 from service.core.equipment.recorded_devices import RecordedIdentity
 from service.run_record import results_to_come
@@ -76,12 +75,12 @@ class _Recorded:
 
 def _recorded(audit: AuditState, run_id: str, digest: Digest | None) -> _Recorded:
     with audit.site.store.database.reading() as connection:
-        root = event_rows.read_rows(connection, run_id, [1], whole=True)
+        root = rows.read_rows(connection, run_id, [1], whole=True)
         opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         sessions = findings.events_of(connection, run_id, "session_started", newest=True)
         return _Recorded(
             root=root[0] if root else None,
-            corrected=event_rows.count_of_kind(connection, run_id, "record_corrected"),
+            corrected=rows.count_of_kind(connection, run_id, "record_corrected"),
             devices={device.name: device.report.identity for device in opened},
             session=sessions[-1] if sessions else None,
             sessions=len(sessions),
@@ -108,7 +107,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         identity=protocol_identity(audit.site.store, run_id, frame.run.protocol, frame.run.version),
         audit=frame,
         digest=known,
-        progress=digest if isinstance(digest, Progress) else None,
+        progress=digest if isinstance(digest, PartialProgress) else None,
         counts=first_page.counts(known) if known else {},
         deviation_groups=DEVIATION_GROUPS,
         note_groups=NOTE_GROUPS,
@@ -145,19 +144,19 @@ def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: s
     known = first_page.known(digest)
     group = group if group in GROUPS else ""
     listed = first_page.findings(known, group) if known else []
-    pages = max(1, -(-len(listed) // run_rows.PAGE))
+    pages = max(1, -(-len(listed) // rows.PAGE))
     page = min(max(page, 1), pages)
     return render(
         request,
         "audit/deviations.html.j2",
         audit=frame,
-        progress=digest if isinstance(digest, Progress) else None,
+        progress=digest if isinstance(digest, PartialProgress) else None,
         groups=GROUPS,
         note_groups=NOTE_GROUPS,
         deviations=len(known.deviations) if known else 0,
         counts=first_page.counts(known) if known else {},
         group=group,
-        listed=listed[(page - 1) * run_rows.PAGE : page * run_rows.PAGE],
+        listed=listed[(page - 1) * rows.PAGE : page * rows.PAGE],
         count=len(listed),
         page=page,
         pages=pages,

@@ -7,8 +7,7 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, BeforeValidator
 
 from service.audit.overview.first_page import RunFilter
-from service.audit.record.artefact_queries import ArtefactFilter
-from service.audit.record.event_search import EventFilter
+from service.audit.record.search import ArtefactFilter, EventFilter
 
 LONGEST = 200  # characters of a filter; more is cut
 

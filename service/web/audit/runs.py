@@ -7,10 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import first_page
 from service.audit.overview.first_page import ListedRun
-from service.audit.record import run_rows
+from service.audit.record import rows
 from service.audit.runs.search import RunSearch, find_runs
 from service.web.audit.frame import AuditState, CurrentAudit, link
 from service.web.audit.queries import RunQuery
@@ -27,7 +27,7 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
     """The runs, newest first."""
     wanted = query.wanted()
     with audit.site.store.database.reading() as connection:
-        every = run_rows.runs(connection)
+        every = rows.runs(connection)
     said = {run.run_id for run in find_runs(audit.site.store, RunSearch(q=wanted.q))}
     listed = [_listed(audit, basics) for basics in every]
     found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, wanted)]
@@ -49,8 +49,8 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
     )
 
 
-def _listed(audit: AuditState, basics: run_rows.RunBasics) -> ListedRun:
+def _listed(audit: AuditState, basics: rows.RunBasics) -> ListedRun:
     digest = audit.digests.at(basics.run_id, basics.head_seq, basics.head_sha256)
-    if isinstance(digest, Progress):
+    if isinstance(digest, PartialProgress):
         audit.digests.warm(basics.run_id)
     return ListedRun(basics, first_page.known(digest), audit.verifications.last(basics.run_id))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import first_page
 from service.audit.overview.signatures import signatures
 from service.web.audit.frame import CurrentAudit, audit_frame
@@ -34,7 +34,7 @@ def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
         audit=frame,
         signatures=found,
         digest=known,
-        progress=digest if isinstance(digest, Progress) else None,
+        progress=digest if isinstance(digest, PartialProgress) else None,
     )
 
 

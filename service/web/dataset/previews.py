@@ -8,7 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from service.audit.background.child_process import ChildProcesses, ChildState
+from service.audit.background import ChildProcesses, ChildState
 from service.core.run.state import RunState
 from service.dataset.preview_records import FILE_NAME, Preview, read_preview
 from service.store.durable_effects import Clock

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from service.audit.background.child_process import Progress, report
+from service.audit.background import Progress, report
 from service.compute.priority import compute_in_background
 
 

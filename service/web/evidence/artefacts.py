@@ -7,10 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
-from service.audit.background.incremental import Progress
-from service.audit.provenance.drawing import draw
-from service.audit.provenance.graph import origin
-from service.audit.record import artefact_queries
+from service.audit.background import PartialProgress
+from service.audit.provenance import draw, origin
+from service.audit.record import search
 from service.jobs.words import term
 from service.web.audit.frame import CurrentAudit, audit_frame, link
 from service.web.audit.queries import ArtefactQuery
@@ -29,8 +28,8 @@ def artefacts_page(
     frame = audit_frame(audit, run_id, "/artefacts")
     wanted = query.wanted()
     with audit.site.store.database.reading() as connection:
-        found = artefact_queries.artefacts_page(connection, run_id, wanted, page=query.page)
-        facets = artefact_queries.artefact_facets(connection, run_id)
+        found = search.artefacts_page(connection, run_id, wanted, page=query.page)
+        facets = search.artefact_facets(connection, run_id)
     return render(
         request,
         "evidence/artefacts.html.j2",
@@ -60,12 +59,12 @@ def provenance_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
     """Show the provenance graph of a run."""
     frame = audit_frame(audit, run_id, "/provenance")
     graph = audit.graphs.get(run_id)
-    known = None if isinstance(graph, Progress) else graph
+    known = None if isinstance(graph, PartialProgress) else graph
     return render(
         request,
         "evidence/provenance.html.j2",
         audit=frame,
-        progress=graph if isinstance(graph, Progress) else None,
+        progress=graph if isinstance(graph, PartialProgress) else None,
         graph=known,
         drawing=draw(known) if known else None,
         term=term,

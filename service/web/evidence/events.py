@@ -7,10 +7,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import findings
-from service.audit.overview.corrections import correctable
-from service.audit.record import artefact_queries, event_rows, event_search, run_rows
+from service.audit.overview.findings import correctable
+from service.audit.record import rows, search
 from service.store.records import SITE
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, link
 from service.web.audit.queries import EventQuery
@@ -41,15 +41,13 @@ def _events(
     wanted = query.wanted()
     digest = here.digests.get(chain) if chain != SITE else None
     with here.site.store.database.reading() as connection:
-        facets = digest.facets if digest is not None and not isinstance(digest, Progress) else event_search.Facets()
-        last, _ = run_rows.head(connection, chain)
+        facets = digest.facets if digest is not None and not isinstance(digest, PartialProgress) else search.Facets()
+        last, _ = rows.head(connection, chain)
         if chain == SITE:
             facets.add(connection, SITE, 0, last)
         counted = facets.matching(wanted) if facets.kinds else None
-        page = event_search.events_page(
-            connection, chain, wanted, after=query.after, before=query.before, counted=counted
-        )
-        devices = artefact_queries.artefact_facets(connection, chain)["device"]
+        page = search.events_page(connection, chain, wanted, after=query.after, before=query.before, counted=counted)
+        devices = search.artefact_facets(connection, chain)["device"]
     address = request.url.path
     return render(
         request,
@@ -58,7 +56,7 @@ def _events(
         wanted=wanted,
         facets=facets,
         devices=sorted({*facets.devices, *devices}),
-        progress=digest if isinstance(digest, Progress) else None,
+        progress=digest if isinstance(digest, PartialProgress) else None,
         last=last,
         earlier=link(address, {**wanted.query(), "before": page.before}) if page.before else "",
         later=link(address, {**wanted.query(), "after": page.after}) if page.after else "",
@@ -77,15 +75,15 @@ def _event(
     request: Request, here: AuditState, chain: str, seq: int, *, may_correct: bool, **context: Any
 ) -> Response:
     with here.site.store.database.reading() as connection:
-        row = event_rows.one_event(connection, chain, seq)
-        last, _ = run_rows.head(connection, chain)
-        brought = artefact_queries.artefacts_of_events(connection, chain, [row.seq])
+        row = rows.one_event(connection, chain, seq)
+        last, _ = rows.head(connection, chain)
+        brought = search.artefacts_of_events(connection, chain, [row.seq])
     return render(
         request,
         "evidence/event.html.j2",
         event=row,
         last=last,
-        computed_sha256=event_rows.computed_sha256(chain, row),
+        computed_sha256=rows.computed_sha256(chain, row),
         brought=brought,
         fields=correctable(row.payload) if may_correct and row.kind != "record_corrected" else [],
         events_at=f"/audit/runs/{chain}/events" if chain != SITE else "/audit/site/events",

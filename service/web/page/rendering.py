@@ -16,7 +16,7 @@ from pydantic import ValidationError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from service.audit.record.event_rows import EventRow
+    from service.audit.record.rows import EventRow
 
 from service.core.records.entered import RunAbout, about_rows
 from service.core.text.clock_time import local_time

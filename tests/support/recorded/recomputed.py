@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from service.audit.record.run import RecordedRun
-from service.audit.replay.scratch import ScratchStore
+from service.audit.replay.recomputed import ScratchStore
 from service.core.jobs.references import jobs_of, resolve
 from service.core.run.state import JobState
 from service.jobs.registration import register

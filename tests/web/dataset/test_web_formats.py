@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.export.folder_zip import zip_chunks
+from service.audit.export.exports import zip_chunks
 from service.audit.export.process import export
 from service.audit.export.wanted import ExportRequest, WantedExport, keep_request
 from service.core.errors import IntegrityError

@@ -1,4 +1,4 @@
-"""The pictures of a report: detected and predicted outlines, the scene, the photographs, and their originals.
+"""The pictures of a report: outlines, scene, photographs with their originals, and the notes taken on its steps.
 
 A report should be small enough to send: under 3 MB with 36 photographs and the scene. The originals are named by
 their hashes, which are their names in the evidence.
@@ -7,13 +7,99 @@ their hashes, which are their names in the evidence.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import wrap
+
+import cv2
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Column, Heading, Paragraph, Pictures, Section, Table, TableCell
-from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
-from service.audit.report.drawings.scene import report_scene
+from service.audit.report.blocks import (
+    Block,
+    Column,
+    Heading,
+    Paragraph,
+    Picture,
+    Pictures,
+    Section,
+    Table,
+    TableCell,
+    utc,
+)
+from service.audit.report.scene import report_scene
+from service.compute.images.shown import decode_reduced
+from service.core.errors import DataError, IntegrityError
 from service.core.protocol.models import Step
+from service.core.records.entered import NoteTaken, about_rows
 from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured
+
+THUMBNAIL_PX = 240
+LARGE_PX = 720
+_QUALITY = 76  # so that a report of 36 photographs stays under 3 MB
+
+
+def picture(run: RecordedRun, sha256: str, caption: str, width_px: int, *, upright: bool = False) -> Picture:
+    """A JPEG copy of limited width without the camera's metadata; empty if the file is missing or altered.
+
+    `upright`: rotate by the orientation tag. Images that are measured are never rotated.
+    """
+    try:
+        path = run.files.artefact_path(sha256, verify=True)
+    except IntegrityError:
+        return Picture(f"{caption}: the file is missing or was altered", None)
+    try:
+        pixels, _ = decode_reduced(path.read_bytes(), width_px, path.name, upright=upright)
+    except DataError:
+        return Picture(f"{caption}: the file cannot be read as a picture", None)
+    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return Picture(caption, jpeg, pixels.shape[1], pixels.shape[0], sha256)
+
+
+_WIDTH_PX = 500
+_PIECE_CHARACTERS = 900
+
+
+def about_facts(run: RecordedRun) -> list[tuple[str, TableCell | str]]:
+    """What was entered when the run began; empty for old runs, which did not ask."""
+    rows: list[tuple[str, TableCell | str]] = []
+    for name, value in about_rows(run.root.about):
+        rows += [(name if part == 0 else "", text) for part, text in enumerate(_pieces(value))]
+    return rows
+
+
+def _pieces(text: str) -> list[str]:
+    """A long text in parts, because a row of a table has to fit on a page."""
+    return wrap(text, _PIECE_CHARACTERS, replace_whitespace=False, break_on_hyphens=False) or [""]
+
+
+def notes_section(run: RecordedRun, *, with_pictures: bool) -> Section | None:
+    """Every note with its step, time and author, and the photographs; None without any."""
+    titles = {step.id: step.title for step in run.protocol.steps}
+    notes = [(event, event.payload) for event in run.events if isinstance(event.payload, NoteTaken)]
+    if not notes:
+        return None
+    rows: list[tuple[str, ...]] = []
+    for event, note in notes:
+        head = (str(event.seq), utc(event.at_utc), titles.get(note.step, note.step), run.named(event.actor))
+        text = " ".join([note.text, "[photograph]"] if note.photograph is not None else [note.text]).strip()
+        rows += [(*(head if part == 0 else ("",) * 4), piece) for part, piece in enumerate(_pieces(text))]
+    columns = (
+        Column("event", 0.5, "number"),
+        Column("time", 1.35),
+        Column("step", 1.3),
+        Column("who", 1.0),
+        Column("note", 3.6),
+    )
+    blocks: list[Block] = [Table(columns, tuple(rows))]
+    pictures = tuple(
+        picture(
+            run, note.photograph.sha256, f"event {event.seq}: {note.text[:120]}".rstrip(": "), _WIDTH_PX, upright=True
+        )
+        for event, note in notes
+        if note.photograph is not None
+    )
+    if pictures and with_pictures:
+        blocks += [Heading("Photographs of the notes"), Pictures(pictures, 3)]
+    return Section("Notes", tuple(blocks))
+
 
 _ORIGINALS = (
     Column("event", 0.5, "number"),

@@ -6,10 +6,23 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from service.audit.overview.shots import Shots, failed_exposures, shots_by_step
+from service.audit.overview.digest import Shots, failed_exposures, shots_by_step
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Column, Paragraph, Section, Table, TableCell
-from service.audit.report.words import clock, duration, judged, limit, measured, utc, words
+from service.audit.report.blocks import (
+    Block,
+    Column,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+    clock,
+    duration,
+    judged,
+    limit,
+    measured,
+    utc,
+    words,
+)
 from service.core.gates.verdict import BOUNDS_HOLD, describe_judged
 from service.core.records.events import (
     DeviceTrouble,
