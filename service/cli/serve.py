@@ -46,12 +46,9 @@ from service.store.signatures.second_place import away_words
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.web.app import create_app
-from service.web.launch import Launcher
-from service.web.server.connections import ConnectionLimits
-from service.web.server.http import known_proxies, listening, server
-from service.web.server.listener import affordable_connections
-from service.web.server.sparing_log import sparing_log, told
-from service.web.site import Site
+from service.web.connections import ConnectionLimits, affordable_connections
+from service.web.server import known_proxies, listening, server, sparing_log, told
+from service.web.site import Launcher, Site
 
 _PROTOCOLS = shipped_protocols()
 _SERVED = "serving.json"  # in the data folder, locked while a server uses it

@@ -22,7 +22,7 @@ from service.dataset.view_covariances import pose_covariance
 from service.run_record import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.known_spheres import displayed_registration, scan_spheres
+from service.web.record.outlines import displayed_registration, scan_spheres
 from service.web.scene.data import scene_of
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 

@@ -31,7 +31,7 @@ SERVICE = {
     "service/compute/matching/scores/evaluate.py": "measures how long a pair of images took",
     "service/compute/poses/sfm/estimate.py": "measures how long a reconstruction took",
     "service/compute/poses/sfm/kept.py": "measures how long a reconstruction took",
-    "service/web/monitoring/request_counts.py": "measures how long a page took",
+    "service/web/monitoring.py": "measures how long a page took",
     # the date of a file that is written now
     "service/audit/report/content.py": "the time of a report that is given none",
     "service/benchmark/running.py": "the time at which a benchmark ended",

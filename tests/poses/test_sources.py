@@ -29,7 +29,7 @@ from service.steps.poses.time_left import missing_results
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.known_spheres import displayed_registration
+from service.web.record.outlines import displayed_registration
 from tests.support.record.store import enqueue
 from tests.support.recorded.registration_record import registration_record
 from tests.support.runs.computing_run import compute_jobs

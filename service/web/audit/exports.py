@@ -21,12 +21,11 @@ from service.people.tries import on_screen_of
 from service.run_acts import release_run, require_releasable
 from service.web.audit.frame import AuditFrame, CurrentAudit, audit_frame
 from service.web.page.rendering import render
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite
+from service.web.security import SignedInPerson, requires
+from service.web.site import CurrentSite, RunId
 
 router = APIRouter(tags=["exports"])
 
-RunId = Annotated[str, Path(max_length=64)]
 _READ = [Depends(requires("read"))]
 _REPORT = [Depends(requires("report"))]
 _EXPORT = [Depends(requires("export"))]

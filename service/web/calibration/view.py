@@ -18,8 +18,7 @@ from service.jobs.records import Camera
 from service.run_record import RunRecord
 from service.steps.kinds.captures.calibration import Params
 from service.web.page.charts import DotPlot, HeatMap, VectorField, dots, heat_map, vector_field
-from service.web.record.board_images import BoardUse, board_use
-from service.web.record.images import StatedCamera, captures_of, stated_camera
+from service.web.record.images import BoardUse, StatedCamera, board_use, captures_of, stated_camera
 
 
 @dataclass(frozen=True, slots=True)

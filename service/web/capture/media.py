@@ -26,10 +26,9 @@ from service.notes import NOTE_PHOTOGRAPH
 from service.run_record import RunRecord
 from service.store.artefacts import to_artefact
 from service.store.database.tables import artefacts
-from service.web.record.images import Capture, find_capture, further_of
+from service.web.record.images import Capture, find_capture, further_of, rig_cameras
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
-from service.web.record.recorded_rig import rig_cameras
-from service.web.security.guards import requires
+from service.web.security import requires
 from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["media"])

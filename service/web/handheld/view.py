@@ -20,7 +20,7 @@ from service.jobs.records import Matrix
 from service.jobs.surfaces import coverage_points
 from service.run_record import RunRecord
 from service.steps.handheld.guide import failure_words
-from service.web.page.run_words import limit, measure_name
+from service.web.page.run_frame import limit, measure_name
 from service.web.record.images import captures_of
 
 SIZE = 480.0  # of the drawing, which is square

@@ -16,7 +16,7 @@ from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, dense
 from service.steps.context import StationLayout
 from service.steps.kinds.captures import calibration
 from service.steps.notes import BOARD_POSES, SUGGESTION, board_plans, suggested_views
-from service.web.record.recorded_rig import recorded_rig_section
+from service.web.record.images import recorded_rig_section
 
 Vector = tuple[float, float, float]
 _lock = Lock()

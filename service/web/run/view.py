@@ -12,7 +12,7 @@ from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import Event, FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
-from service.core.recovery.ways_on import WayOn, takes_words
+from service.core.recovery.ways_on import WayOn, planned_views, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.connections import lost_arms
 from service.core.run.decide import AskOperator, lapsed_words
@@ -23,22 +23,20 @@ from service.core.text.clock_time import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.run_record import OpenJob
-from service.web.page.run_standing import run_standing
-from service.web.page.run_words import (
+from service.web.page.run_frame import (
     count,
     drawing_of,
     figure_line,
     needs,
     phase_words,
-    planned_views,
+    run_standing,
     sentence,
     station_of,
     stopped_words,
     way_words,
     will_happen,
 )
-from service.web.record.board_images import unused_count
-from service.web.run.figures import capture_progress, gate_lines, readings
+from service.web.record.images import unused_count
 from service.web.run.view_records import (
     Acceptance,
     ChecklistItem,
@@ -55,6 +53,9 @@ from service.web.run.view_records import (
     StepTrouble,
     StepView,
     Viewer,
+    capture_progress,
+    gate_lines,
+    readings,
 )
 
 NOT_MEASURED: EarlierTimes = {}

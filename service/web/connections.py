@@ -1,16 +1,22 @@
-"""Who may hold a connection and for how long: limits in all and by address, by which strangers make room."""
+"""Holds the limits on connections: who may have one, for how long, from when it is accepted, and open streams."""
 
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
+import resource
 import socket
 import weakref
 from collections import Counter
-from collections.abc import Container, Generator, Iterable
+from collections.abc import Callable, Container, Generator, Iterable
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from ipaddress import IPv6Address, ip_address
+from typing import Any
+from weakref import finalize
+
+from service.core.units import ms
 
 _log = logging.getLogger("orthocapture.connections")
 
@@ -152,3 +158,116 @@ def plain_address(text: str) -> str:
         return text
     mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
     return str(mapped or address)
+
+
+@dataclass(eq=False, slots=True)
+class OpenStream:
+    """The event stream of one page."""
+
+    screen: str
+    replaced: bool = False  # it is to say so and to end
+
+
+class OpenStreams:
+    """All streams of a server, oldest first. Used in the thread of its event loop alone.
+
+    A page that was loaded again, or a tablet that dropped out, leaves a stream behind for a while. Were the new one
+    refused, the person would be without news: so it replaces the oldest of its sign-in, or of the one that has most.
+    """
+
+    def __init__(self, *, per_screen: int = 6, in_all: int = 60) -> None:
+        self._per_screen = per_screen
+        self._in_all = in_all
+        self._open: list[OpenStream] = []
+
+    @contextmanager
+    def opened(self, screen: str) -> Generator[OpenStream]:
+        """A place among the streams of a sign-in, for as long as it lasts."""
+        count = Counter(stream.screen for stream in self._open)
+        if count[screen] >= self._per_screen:
+            self._end_oldest(screen)
+        elif len(self._open) >= self._in_all:
+            self._end_oldest(max(count, key=lambda each: count[each]))
+        stream = OpenStream(screen)
+        self._open.append(stream)
+        try:
+            yield stream
+        finally:
+            if stream in self._open:
+                self._open.remove(stream)
+
+    def _end_oldest(self, screen: str) -> None:
+        oldest = next(stream for stream in self._open if stream.screen == screen)
+        oldest.replaced = True
+        self._open.remove(oldest)
+
+
+_BACKLOG = 128  # connections that wait in the kernel
+ACCEPTED_AT_ONCE = 8  # before the event loop reads what the last ones have sent: their requests may be there already
+_EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class Listener(socket.socket):
+    """Listens for asyncio's servers, which call `accept` until it would block."""
+
+    def __init__(self, family: socket.AddressFamily, connections: Connections) -> None:
+        super().__init__(family, socket.SOCK_STREAM)
+        self.connections = connections
+        self._exhausted = False
+
+    def listen(self, backlog: int = _BACKLOG, /) -> None:
+        """Listen with a queue of at least _BACKLOG; asyncio's smaller number is how many it accepts at once."""
+        super().listen(max(backlog, _BACKLOG))
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept the next connection. Raises BlockingIOError if there is none, or no room for it, and OSError."""
+        if self._exhausted:
+            # After a system error, asyncio calls accept again, backlog times in all, and logs each error before it
+            # pauses for a second. BlockingIOError ends that loop after the first error.
+            self._exhausted = False
+            raise BlockingIOError
+        try:
+            plain, address = super().accept()
+        except OSError as error:
+            if error.errno in _EXHAUSTED:
+                self._exhausted = True
+                self.connections.make_room()
+            raise
+        accepted = _AcceptedSocket(plain, self.connections.limits.wait_s)
+        connection = self.connections.admit(accepted, (address[0], address[1]))
+        if connection is None:
+            accepted.close()
+            raise BlockingIOError  # the event loop calls again at once if other connections are waiting
+        accepted.at_close(lambda: self.connections.leave(connection))
+        return accepted, address
+
+
+class _AcceptedSocket(socket.socket):
+    """An accepted socket that tells when it is closed."""
+
+    def __init__(self, plain: socket.socket, wait_s: float) -> None:
+        super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
+        self._closed_hook: Callable[[], object] = _nothing
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            # A tablet out of reach acknowledges nothing: it is given up, and its streams with it.
+            with suppress(OSError):  # it may have been reset in the queue
+                self.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(ms(wait_s)))
+
+    def at_close(self, hook: Callable[[], object]) -> None:
+        """Call this once, when the socket is closed or was forgotten."""
+        self._closed_hook = finalize(self, hook)
+
+    def close(self) -> None:
+        """Close the socket and call the hook of `at_close`."""
+        super().close()
+        self._closed_hook()
+
+
+def _nothing() -> None:
+    """Stand in until somebody asks to be told that a connection was closed."""
+
+
+def affordable_connections(wanted: int) -> int:
+    """The wanted number of connections, at most half of the files that this process may open."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))

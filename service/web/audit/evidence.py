@@ -1,4 +1,4 @@
-"""The events of a run and of the site, as they were recorded."""
+"""The events of a run and of the site as they were recorded, and its files: where each came from."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from fastapi.responses import HTMLResponse, Response
 from service.audit.background import PartialProgress
 from service.audit.overview import findings
 from service.audit.overview.findings import correctable
+from service.audit.provenance import draw, origin
 from service.audit.record import rows, search
+from service.jobs.words import term
 from service.store.records import SITE
-from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, link
-from service.web.audit.queries import EventQuery
+from service.web.audit.frame import ArtefactQuery, AuditState, CurrentAudit, EventQuery, audit_frame, link
 from service.web.page.rendering import render
-from service.web.security.guards import SignedInPerson, requires
+from service.web.security import SignedInPerson, requires
 
 router = APIRouter(tags=["audit"])
 _READ = [Depends(requires("read"))]
@@ -27,7 +28,7 @@ def timeline_page(
 ) -> Response:
     """The events of a run in order, filtered and searched."""
     frame = audit_frame(audit, run_id, "/timeline")
-    return _events(request, audit, run_id, query, "evidence/timeline.html.j2", audit=frame)
+    return _events(request, audit, run_id, query, "audit/timeline.html.j2", audit=frame)
 
 
 def _events(
@@ -80,7 +81,7 @@ def _event(
         brought = search.artefacts_of_events(connection, chain, [row.seq])
     return render(
         request,
-        "evidence/event.html.j2",
+        "audit/event.html.j2",
         event=row,
         last=last,
         computed_sha256=rows.computed_sha256(chain, row),
@@ -102,7 +103,7 @@ def site_page(request: Request, audit: CurrentAudit, query: Annotated[EventQuery
         audit,
         SITE,
         query,
-        "evidence/site.html.j2",
+        "audit/site.html.j2",
         starts=list(reversed(starts)),
         keys=keys,
     )
@@ -112,3 +113,54 @@ def site_page(request: Request, audit: CurrentAudit, query: Annotated[EventQuery
 def site_event_page(request: Request, audit: CurrentAudit, seq: int) -> Response:
     """One event of the site's chain."""
     return _event(request, audit, SITE, seq, may_correct=False)
+
+
+@router.get("/audit/runs/{run_id}/artefacts", name="audit_artefacts", dependencies=_READ, response_class=HTMLResponse)
+def artefacts_page(
+    request: Request, audit: CurrentAudit, run_id: str, query: Annotated[ArtefactQuery, Query()]
+) -> Response:
+    """Every file of a run."""
+    frame = audit_frame(audit, run_id, "/artefacts")
+    wanted = query.wanted()
+    with audit.site.store.database.reading() as connection:
+        found = search.artefacts_page(connection, run_id, wanted, page=query.page)
+        facets = search.artefact_facets(connection, run_id)
+    return render(
+        request,
+        "audit/artefacts.html.j2",
+        audit=frame,
+        found=found,
+        wanted=wanted,
+        facets=facets,
+        href=lambda number: link(f"{frame.base}/artefacts", {**wanted.query(), "page": number}),
+    )
+
+
+@router.get(
+    "/audit/runs/{run_id}/artefacts/{sha256}", name="audit_artefact", dependencies=_READ, response_class=HTMLResponse
+)
+def artefact_page(request: Request, audit: CurrentAudit, run_id: str, sha256: str) -> Response:
+    """Show one file: what it is, where it came from, and what was made from it."""
+    frame = audit_frame(audit, run_id, "/artefacts")
+    with audit.site.store.database.reading() as connection:
+        found = origin(connection, run_id, sha256)
+    return render(request, "audit/artefact.html.j2", audit=frame, origin=found, artefact=found.records[0])
+
+
+@router.get(
+    "/audit/runs/{run_id}/provenance", name="audit_provenance", dependencies=_READ, response_class=HTMLResponse
+)
+def provenance_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """Show the provenance graph of a run."""
+    frame = audit_frame(audit, run_id, "/provenance")
+    graph = audit.graphs.get(run_id)
+    known = None if isinstance(graph, PartialProgress) else graph
+    return render(
+        request,
+        "audit/provenance.html.j2",
+        audit=frame,
+        progress=graph if isinstance(graph, PartialProgress) else None,
+        graph=known,
+        drawing=draw(known) if known else None,
+        term=term,
+    )
