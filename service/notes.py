@@ -92,7 +92,7 @@ def _checked(photograph: NotePhotograph) -> tuple[str, str]:
     # The decoder takes long to load, and a web process starts without it.
     import cv2  # noqa: PLC0415
 
-    from service.compute.images.decode import decode  # noqa: PLC0415
+    from service.compute.images.photographs import decode  # noqa: PLC0415
 
     content, name = photograph.content, _plain(photograph.name)
     require_size(len(content), name)

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.arm.correction import CorrectedMounting
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.arm_correction import CorrectedMounting
+from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.core.arms.known import arm_model
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, transform

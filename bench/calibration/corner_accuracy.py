@@ -17,9 +17,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.calibration.board.board import Board, find_board
+from service.compute.board.board import Board, find_board
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_grey
+from service.compute.images.photographs import read_grey
 from service.core.geometry import apply, transform
 from tests.support.boards.board_images import Photography, checkerboard, photograph
 

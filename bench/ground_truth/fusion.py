@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from bench.ground_truth.seam import no_seam, seam, steps, strips
 from bench.machine import RESULTS, commit, machine
-from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.triangle_tree import TriangleTree
-from service.compute.ground_truth.fusion.fuse import FusionSettings, Source, fuse
+from service.compute.ground_truth.distances import PointIndex, TriangleTree
+from service.compute.ground_truth.fuse import FusionSettings, Source, fuse
 from service.compute.ground_truth.surface import Surface
 from service.compute.surfaces.isosurface import surface
 from service.core.geometry import Array, apply

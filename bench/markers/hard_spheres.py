@@ -22,8 +22,7 @@ from bench.markers.outlines import LOOKS, TWO_LAMPS
 from bench.markers.sphere_conditions import measure, places
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.detect import detect_spheres
-from service.compute.markers.detectors import options_for
+from service.compute.markers.detect import detect_spheres, options_for
 from service.compute.markers.records import DetectionOptions
 from service.core.geometry import Array
 from tests.support.scenes.sphere_conditions import Look, render_look

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from bench.machine import RESULTS, machine
 from bench.scenes import rendered
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image, read_reduced
+from service.compute.images.photographs import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
+from service.compute.markers.image_files import ANCHOR_WIDTH_PX
+from service.compute.markers.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.anchors import ANCHOR_WIDTH_PX
-from service.compute.markers.search.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.files.pose_files import read_poses
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.pose_files import read_poses
 from service.core.geometry import inverse
 
 SCENES = ("scene01_1920_20", "scene01_4752_18", "scene01_9504_12")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError
 from tests.support.scenes.sphere_meshes import RADIUS_M, MeshBuilder, cap, clutter, scattered_centres
 

@@ -18,10 +18,9 @@ import numpy as np
 from bench.machine import RESULTS
 from bench.markers.outlines import LOOKS, SIDE_LAMP, TWO_LAMPS
 from service.compute.camera_model import CameraModel
-from service.compute.markers.colours import colour_of
 from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.detectors import DETECTORS
-from service.compute.markers.records import DEFAULTS, SphereOutline
+from service.compute.markers.detect import DETECTORS
+from service.compute.markers.records import DEFAULTS, SphereOutline, colour_of
 from service.core.geometry import Array
 from tests.support.scenes.sphere_conditions import COLOURS_BGR, Look, Picture, picture_of
 from tests.support.scenes.sphere_images import RADIUS_M, camera

@@ -55,7 +55,7 @@ PLACES = {
     "service/cli/runs.py": "days that a person asks for",
     "service/cli/doctor.py": _STAMP,
     "service/cli/serve.py": _STAMP,
-    "service/compute/poses/sfm/kept.py": _CHANGE,
+    "service/compute/sfm/front_end.py": _CHANGE,
     "service/core/equipment/clocks.py": "offsets of cameras' clocks within one process, which are shown",
     "service/core/records/moments.py": "age of the coat",
     "service/core/run/expected.py": _FIGURE,

@@ -22,12 +22,12 @@ from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
 from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import true_error_m
-from service.compute.markers.search.image_files import detect_all
+from service.compute.hybrid.estimate import hybrid_poses
+from service.compute.markers.image_files import detect_all
 from service.compute.pipeline import register_images
-from service.compute.poses.hybrid.estimate import hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
-from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.compute.scene import PosedImages, ScanSpheres
+from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
+from service.compute.sfm.options import Effort, Mapper, options_for
 from service.core.geometry import Array, align_points, apply, inverse
 
 COLUMNS = (

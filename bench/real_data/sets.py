@@ -23,9 +23,8 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
 from service.compute.camera_model import CameraModel
-from service.compute.markers.detect import detect_spheres
-from service.compute.markers.detectors import options_for
-from service.compute.poses.files.pose_files import read_poses
+from service.compute.markers.detect import detect_spheres, options_for
+from service.compute.poses.pose_files import read_poses
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points
 

@@ -23,8 +23,7 @@ from bench.scenes import CACHE, render_scene
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.records import BenchmarkResult, Score, read_results
 from service.benchmark.scoring import compare
-from service.compute.ground_truth.fusion.cut_out import Markers
-from service.compute.ground_truth.fusion.fuse import compact
+from service.compute.ground_truth.fuse import Markers, compact
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import inverse
 from service.core.units import metres

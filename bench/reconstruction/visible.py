@@ -19,9 +19,9 @@ import numpy as np
 from bench.machine import RESULTS, commit, machine
 from bench.reconstruction.simulated import simulated_data_set
 from bench.scenes import CACHE, render_scene
-from service.compute.ground_truth.distances.neighbours import PointIndex
+from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.surface import IntArray, Surface
-from service.compute.pixels.ray_mesh import RayMesh
+from service.compute.pixels.render import RayMesh
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm
 from service.dataset.records import DataSet

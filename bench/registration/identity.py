@@ -16,7 +16,7 @@ from bench.machine import RESULTS
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import OutlineEvidence, SphereOutline, outline_from_cone
-from service.compute.registration.identification.identity import identify_each
+from service.compute.registration.identity import identify_each
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, look_at

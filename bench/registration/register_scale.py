@@ -24,11 +24,11 @@ import numpy as np
 
 from bench.machine import RESULTS, machine
 from bench.scenes import rendered
-from service.compute.images.files import read_image
-from service.compute.markers.search.image_files import detect_all, locate_outlines
+from service.compute.images.photographs import read_image
+from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.pipeline import register_images
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.files.pose_files import read_poses
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.pose_files import read_poses
 from service.compute.scene import PosedImages, ScanSpheres
 
 FILES = (("scene01_9504_12", (16, 32, 64, 108)), ("scene01_1920_20", (250, 1000)))

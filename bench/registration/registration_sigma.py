@@ -17,13 +17,20 @@ from bench.registration.accuracy import Capture, read_capture
 from bench.registration.identity import CAMERA
 from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, true_error_m
-from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.records import OutlineEvidence, SphereOutline, outline_from_cone
-from service.compute.pipeline import detect_all, register_images
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.markers.image_files import detect_all
+from service.compute.markers.records import (
+    OutlineEvidence,
+    SphereOutline,
+    outline_from_cone,
+    outline_from_record,
+    outline_record,
+)
+from service.compute.pipeline import register_images
+from service.compute.registration.cost import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.scene.world import RADIUS_M, Scene

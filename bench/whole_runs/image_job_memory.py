@@ -31,7 +31,7 @@ import psutil
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.job_memory import RADIUS_M, SCENE, Folder
 from service.compute.images.develop_parameters import PARAMETERS
-from service.compute.memory import keep_freed_memory
+from service.compute.resources import keep_freed_memory
 from service.core.units import megabytes
 from service.jobs.kind import JobKind
 from service.jobs.poses import features, match

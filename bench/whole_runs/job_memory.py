@@ -32,9 +32,8 @@ from typing import Any
 import numpy as np
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from service.compute.ground_truth.ply import read_ply
-from service.compute.ground_truth.surface import Surface
-from service.compute.memory import keep_freed_memory
+from service.compute.ground_truth.surface import Surface, read_ply
+from service.compute.resources import keep_freed_memory
 from service.core.records.events import ArtefactRef
 from service.core.units import metres
 from service.jobs.surfaces import coverage_points, ct_surface, fuse, locate_spheres

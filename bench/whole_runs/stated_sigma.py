@@ -22,8 +22,8 @@ from bench.machine import RESULTS, commit, machine
 from service.cli.demo import true_cameras
 from service.compute.camera_model import CameraModel
 from service.compute.pipeline import register_images
-from service.compute.registration.camera_errors import camera_errors
-from service.compute.registration.settings import RegistrationSettings
+from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.pose_errors import camera_errors
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, skew
 from service.core.jobs.references import jobs_of

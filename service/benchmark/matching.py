@@ -12,11 +12,19 @@ from numpy.typing import NDArray
 from pydantic import FiniteFloat, TypeAdapter
 
 from service.benchmark.matching_results import MethodResult, markdown, read_result, result_of, write_result
+from service.compute.matching.loader import MatchingData, Pair
 from service.compute.matching.methods.method import Match, Matcher, Matches, Picture
-from service.compute.matching.pairs.difficulty import CLASSES
-from service.compute.matching.pairs.loader import MatchingData, Pair
-from service.compute.matching.scores.evaluate import DAMAGED, LoadedViews, PairScore, Progress, chosen_pairs, evaluate
-from service.compute.matching.scores.matches import PRECISION_PX, match_errors_px
+from service.compute.matching.pairs import CLASSES
+from service.compute.matching.scores import (
+    DAMAGED,
+    PRECISION_PX,
+    LoadedViews,
+    PairScore,
+    Progress,
+    chosen_pairs,
+    evaluate,
+    match_errors_px,
+)
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 

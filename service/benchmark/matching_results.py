@@ -12,12 +12,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
+from service.compute.matching.loader import MatchingData
 from service.compute.matching.methods.method import Matcher
-from service.compute.matching.pairs.difficulty import CLASSES
-from service.compute.matching.pairs.loader import MatchingData
-from service.compute.matching.scores.evaluate import PairScore
-from service.compute.matching.scores.matches import PRECISION_PX
-from service.compute.matching.scores.pose import INLIER_PX, THRESHOLDS_DEG, PoseError, auc
+from service.compute.matching.pairs import CLASSES
+from service.compute.matching.scores import INLIER_PX, PRECISION_PX, THRESHOLDS_DEG, PairScore, PoseError, auc
 from service.core.errors import DataError
 
 ALL = "all"

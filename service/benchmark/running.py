@@ -22,9 +22,8 @@ from service.benchmark.methods import Command, Method, Workplace, missing, place
 from service.benchmark.programs import measured
 from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Scenario, Score
 from service.benchmark.scoring import score_mesh, write_scored
-from service.compute.ground_truth.distances.chamfer import ChamferSettings
-from service.compute.ground_truth.ply import write_ply
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.chamfer import ChamferSettings
+from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
 from service.dataset.exported import scaled_data_set

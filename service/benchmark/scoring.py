@@ -9,13 +9,12 @@ import numpy as np
 import trimesh
 
 from service.benchmark.records import Score
-from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
-from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
-from service.compute.ground_truth.fusion.fuse import compact
-from service.compute.ground_truth.fusion.regions import Box
-from service.compute.ground_truth.ply import write_ply
-from service.compute.ground_truth.surface import Surface
-from service.compute.memory import large_arrays_returned
+from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
+from service.compute.ground_truth.fuse import compact
+from service.compute.ground_truth.heat_map import HeatScale, heat_picture
+from service.compute.ground_truth.overlap import Box
+from service.compute.ground_truth.surface import Surface, write_ply
+from service.compute.resources import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm

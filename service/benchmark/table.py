@@ -15,10 +15,9 @@ from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import Method, Workplace, missing
 from service.benchmark.records import SCENARIOS, BenchmarkResult, Scenario
 from service.benchmark.running import truth_file
-from service.compute.ground_truth.distances.chamfer import OUTLIER_M, DistanceSamples
-from service.compute.ground_truth.distances.heat_map import HeatScale, Panel, heat_bar, heat_row
-from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.sampling import sample
+from service.compute.ground_truth.chamfer import OUTLIER_M, DistanceSamples, sample
+from service.compute.ground_truth.distances import PointIndex
+from service.compute.ground_truth.heat_map import HeatScale, Panel, heat_bar, heat_row
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
 from service.dataset.formats.meshes import png

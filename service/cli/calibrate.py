@@ -34,28 +34,25 @@ from service.cli.intrinsics import (
     intrinsics_command,
     searched,
 )
-from service.compute.arm.joint_file import read_joints_csv
-from service.compute.arm.kinematics import active_tool, matching_arm, solve_joints
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board.images import UsableViews
-from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
-from service.compute.calibration.board_poses.plan_plot import draw_board_plan
-from service.compute.calibration.hand_eye.answers import HandEyeResult
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.fit import Method
-from service.compute.calibration.hand_eye.reprojection import BoardCorners, board_corners
-from service.compute.calibration.hand_eye.setup import PoseReading, PosesAsRead, Setup
-from service.compute.calibration.intrinsics.estimate import locate_view
-from service.compute.camera_covariance import read_camera_covariance
-from service.compute.camera_model import CameraModel
-from service.compute.images.folder import ImageFolder, image_folder
-from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.poses.files.pose_files import only_posed, posed_images
-from service.compute.poses.files.robot_poses import (
+from service.compute.arm_kinematics import active_tool, matching_arm, solve_joints
+from service.compute.board.board import Board
+from service.compute.board.next_poses import SuggestedPose, draw_board_plan, suggest_board_poses
+from service.compute.board.search import UsableViews
+from service.compute.camera_model import CameraModel, read_camera_covariance
+from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.hand_eye.fit import Method
+from service.compute.hand_eye.reprojection import BoardCorners, board_corners
+from service.compute.hand_eye.setup import PoseReading, PosesAsRead, Setup
+from service.compute.images.photographs import ImageFolder, image_folder
+from service.compute.intrinsics.estimate import locate_view
+from service.compute.poses.camera_files import read_camera_json
+from service.compute.poses.pose_files import only_posed, posed_images
+from service.compute.poses.robot_files import (
     RobotPoseTable,
     RotationForm,
     matched_rows,
     other_orders,
+    read_joints_csv,
     read_robot_poses,
 )
 from service.core.arms.known import arm_model

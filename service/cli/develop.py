@@ -13,7 +13,7 @@ import typer
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder, write_whole
 from service.compute.images.develop import Developed, develop, encode_tiff
 from service.compute.images.develop_parameters import PARAMETERS
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.core.errors import ConfigurationError, DataError
 
 _JPEGS = (".jpg", ".jpeg")

@@ -22,9 +22,8 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
-from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
-from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
+from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
+from service.compute.ground_truth.heat_map import HeatScale, heat_picture, write_heat_mesh
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import ConfigurationError
 from service.core.units import metres, mm

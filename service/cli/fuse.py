@@ -20,16 +20,11 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, align
-from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
-from service.compute.ground_truth.distances.heat_map import HeatScale
-from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
-from service.compute.ground_truth.fusion.common import CommonPart, common_part
-from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
-from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
-from service.compute.ground_truth.fusion.picture import fusion_picture
-from service.compute.ground_truth.ply import write_ply
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, CommonPart, align, common_part
+from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
+from service.compute.ground_truth.fuse import Fused, FusionSettings, Markers, Source, fuse, without_markers
+from service.compute.ground_truth.heat_map import HeatScale, fusion_picture, write_heat_mesh
+from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.units import metres, mm
 
 

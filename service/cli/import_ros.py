@@ -21,11 +21,18 @@ from service.cli.common import (
     require_writable_folder,
     tell_left_out,
 )
-from service.compute.poses.files.camera_files import write_camera_json
-from service.compute.poses.files.pose_files import write_poses_csv
-from service.compute.poses.ros.frames import FoundPose, FrameTree, NoPoseError, Timing
-from service.compute.poses.ros.messages import StampedImage, StampedTransform
-from service.compute.poses.ros.recording import Recording, read_recording, recording_file
+from service.compute.poses.camera_files import write_camera_json
+from service.compute.poses.pose_files import write_poses_csv
+from service.compute.poses.ros_messages import StampedImage, StampedTransform
+from service.compute.poses.ros_recording import (
+    FoundPose,
+    FrameTree,
+    NoPoseError,
+    Recording,
+    Timing,
+    read_recording,
+    recording_file,
+)
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Transform
 from service.core.picture_files import kind_of

@@ -23,25 +23,22 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
-from service.compute.calibration.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
-from service.compute.calibration.board.images import UsableViews, find_boards, probe_board, usable_views
-from service.compute.calibration.intrinsics.adjustment import LensModel
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
-from service.compute.calibration.intrinsics.optics import Optics, compare_optics, states_focus, summary
-from service.compute.calibration.intrinsics.plots import calibration_plots
-from service.compute.calibration.intrinsics.uncertainty import (
-    ProjectionUncertainty,
-    board_distance_m,
-    projection_uncertainty,
-)
-from service.compute.calibration.intrinsics.validation import (
+from service.compute.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
+from service.compute.board.search import UsableViews, find_boards, probe_board, usable_views
+from service.compute.images.photographs import image_folder, image_size
+from service.compute.intrinsics.adjustment import LensModel
+from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
+from service.compute.intrinsics.optics import Optics, compare_optics, states_focus, summary
+from service.compute.intrinsics.plots import calibration_plots
+from service.compute.intrinsics.uncertainty import (
     MIN_VIEWS_TO_VALIDATE,
     CrossValidation,
+    ProjectionUncertainty,
+    board_distance_m,
     calibration_warnings,
     cross_validate,
+    projection_uncertainty,
 )
-from service.compute.images.files import image_size
-from service.compute.images.folder import image_folder
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.text.counts import counted
 from service.core.units import metres, mm

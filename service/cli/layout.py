@@ -12,13 +12,13 @@ from rich.table import Table
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
 from service.cli.spheres import spheres_of
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
+from service.compute.layout.moves import Move, suggest_moves
 from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph
 from service.compute.layout.photographs import layout_from_photographs
-from service.compute.layout.sphere_moves import Move, suggest_moves
 from service.compute.markers.detect import detect_spheres
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import metres, mm

@@ -25,14 +25,13 @@ from service.cli.common import (
     write_whole,
 )
 from service.cli.spheres import SeedsOption, spheres_of
-from service.compute.camera_covariance import read_camera_covariance
+from service.compute.camera_model import read_camera_covariance
 from service.compute.evaluation.control_spheres import LEAST_SHARE, MOST_WORST_MM, ExpectedNearby
-from service.compute.images.folder import image_folder
-from service.compute.markers.detectors import options_for
-from service.compute.markers.grounded.detector import GroundedDetector
-from service.compute.markers.grounded.weights import VARIABLE, weights_in
-from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import (
+from service.compute.images.photographs import image_folder
+from service.compute.markers.detect import options_for
+from service.compute.markers.grounded import GroundedDetector
+from service.compute.markers.grounded_networks import VARIABLE, weights_in
+from service.compute.markers.image_files import (
     DetectFile,
     LocatedOutlines,
     detect_all,
@@ -40,10 +39,11 @@ from service.compute.markers.search.image_files import (
     search_nearby,
     searched_whole,
 )
-from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
+from service.compute.markers.paper import detect_file_by_masks, read_boxes
+from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.files.pose_files import posed_images
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
 from service.core.gates.verdict import describe_judged, judge

@@ -28,18 +28,17 @@ from service.cli.common import (
     tell_left_out,
     write_whole,
 )
-from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
-from service.compute.images.folder import image_folder
-from service.compute.markers.search.image_files import detect_all
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
-from service.compute.poses.files.pose_covariance import write_pose_covariance
-from service.compute.poses.files.pose_files import read_poses_csv, write_poses_csv
-from service.compute.poses.files.robot_files import read_hand_eye, read_stations
-from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
-from service.compute.poses.sfm.options import Effort, Refine, options_for
+from service.compute.camera_model import CameraCovariance, read_camera_covariance
+from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
+from service.compute.images.photographs import image_folder
+from service.compute.markers.image_files import detect_all
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
+from service.compute.poses.pose_files import read_poses_csv, write_poses_csv
+from service.compute.poses.robot_files import read_hand_eye, read_stations
 from service.compute.scene import PosedImages, ScanSpheres
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
+from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, write_pose_covariance
+from service.compute.sfm.options import Effort, Refine, options_for
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
 from service.core.units import deg, metres, mm

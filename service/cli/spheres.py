@@ -24,8 +24,13 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
-from service.compute.surfaces.spheres.other_radii import MeasuredRadius, seen_radius
+from service.compute.surfaces.mesh_spheres import (
+    MeasuredRadius,
+    MeshSphere,
+    SphereLimits,
+    locate_spheres,
+    seen_radius,
+)
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted

@@ -1,35 +1,36 @@
-"""The whole pipeline from outlines and poses to a registration and its evaluation, without a run or a store."""
+"""Computes a registration and its evaluation from outlines and poses, and draws them, without a run or a store."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.contradictions.common_errors import (
-    UNEXPLAINED,
-    BeyondModel,
-    beyond_model,
-    held_lens_covariance,
-)
-from service.compute.contradictions.findings import Contradiction
-from service.compute.contradictions.odd_images import describe_left_out, odd_images, too_many
-from service.compute.contradictions.odd_spheres import odd_spheres, require_handedness
 from service.compute.evaluation.accuracy import Evaluation
 from service.compute.evaluation.control_spheres import ControlEvaluation, SearchNearby, evaluate_controls
+from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import detect_all, locate_outlines
-from service.compute.registration.identification.identity import Assignment, identify
-from service.compute.registration.settings import RegistrationSettings
-from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
+from service.compute.registration.common_errors import UNEXPLAINED, BeyondModel, beyond_model, held_lens_covariance
+from service.compute.registration.contradictions import (
+    Contradiction,
+    describe_left_out,
+    odd_images,
+    odd_spheres,
+    require_handedness,
+    too_many,
+)
+from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.result import OutlineResidual, RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform
+from service.core.geometry import Array, Transform, apply, inverse
 from service.core.units import mm
-
-__all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
 
 INTRINSICS = "intrinsics"  # name of the component of the covariance
 _CHECKED_TIMES = 3  # an image far off can hide another
@@ -290,3 +291,58 @@ def _detection(outline: SphereOutline, index: int, record: OutlineResidual | Non
         None if record is None else record.rms_px,
         "" if record is None else record.reason,
     )
+
+
+_REGISTRATION, _CONTROL, _UNUSED, _EXCLUDED, _PREDICTED = (
+    (60, 220, 60), (255, 160, 0), (160, 160, 160), (40, 40, 255), (0, 220, 255),
+)  # fmt: skip
+
+
+def draw_overlay(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    detections: Sequence[Detection],
+    *,
+    T_scan_camera: Transform | None = None,
+    registration_centres_m: Array | None = None,
+    control_centres_m: Array | None = None,
+    radius_m: float = 0.015,
+) -> NDArray[np.uint8]:
+    """A copy (H, W, 3) with detected outlines (green: registration, blue: control, grey: unused, red: excluded),
+    their sphere numbers, and the outlines that the registration predicts, dashed in yellow.
+    """
+    picture = image_bgr.copy()
+    width = max(1, round(camera.width / 900))
+    if T_scan_camera is not None and np.all(np.isfinite(T_scan_camera)):
+        for centres in (registration_centres_m, control_centres_m):
+            if centres is not None:
+                for c in apply(inverse(T_scan_camera), centres):
+                    _dashed(picture, c, radius_m, camera, width)
+    for d in detections:
+        colour, label = _UNUSED, ""
+        if d.marker is not None:
+            colour, label = (_EXCLUDED if d.excluded else _REGISTRATION), str(d.marker)
+        elif d.control is not None:
+            colour, label = _CONTROL, f"C{d.control}"
+        curve = np.rint(d.outline.captured_px(camera) * 16).astype(np.int32)
+        cv2.polylines(picture, [curve], True, colour, width, cv2.LINE_AA, shift=4)
+        if label:
+            x, y = (round(v) for v in d.outline.centre_px)
+            size = camera.width / 1900
+            for tone, thickness in (((0, 0, 0), 4 * width), (colour, 2 * width)):
+                place = (x - round(10 * size * len(label)), y + round(10 * size))
+                cv2.putText(picture, label, place, cv2.FONT_HERSHEY_SIMPLEX, size, tone, thickness, cv2.LINE_AA)
+    return picture
+
+
+def _dashed(picture: NDArray[np.uint8], centre: Array, radius_m: float, camera: CameraModel, width: int) -> None:
+    if centre[2] < 3 * radius_m:
+        return
+    cone = cone_of_sphere(centre, radius_m)
+    middle = camera.project(centre[None])[0]
+    if not (-0.2 < middle[0] / camera.width < 1.2 and -0.2 < middle[1] / camera.height < 1.2):
+        return
+    curve = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 97), np.full(97, cone.half_angle_rad * 1.04)))
+    points = np.rint(curve * 16).astype(np.int32)
+    for k in range(0, 96, 4):
+        cv2.polylines(picture, [points[k : k + 3]], False, _PREDICTED, width, cv2.LINE_AA, shift=4)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.splits import Splits
+from service.compute.pixels.views import Splits
 from service.core.errors import DataError
 from service.core.text.json_text import parse_json
 from service.dataset.export_folder import SUMS, check_folder

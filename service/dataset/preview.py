@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.coverage import seen_points
-from service.compute.pixels.crops import FULL_HD, ImageCrop, marker_free_crops
+from service.compute.pixels.render import seen_points
+from service.compute.pixels.views import FULL_HD, ImageCrop, marker_free_crops
 from service.core.errors import ComputeError, DataError
 from service.core.units import mm
 from service.dataset.preview_records import CropPreview, Preview, ViewPreview, put, write_preview

@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.distances.chamfer import ChamferSettings, chamfer
-from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
-from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.sampling import sample
-from service.compute.ground_truth.fusion.fuse import Source
-from service.compute.ground_truth.ply import read_ply
-from service.compute.ground_truth.surface import Surface
-from service.compute.pixels.coverage import covered_shares
+from service.compute.ground_truth.chamfer import ChamferSettings, chamfer, sample
+from service.compute.ground_truth.distances import PointIndex
+from service.compute.ground_truth.fuse import Source
+from service.compute.ground_truth.heat_map import HeatScale, heat_picture
+from service.compute.ground_truth.surface import Surface, read_ply
+from service.compute.pixels.render import covered_shares
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.splits import Splits
+from service.compute.pixels.views import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.records.attribution import Party, doi_address, licence_address, party

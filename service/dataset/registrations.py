@@ -94,7 +94,7 @@ def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
     """A note that some rows share one adjustment, so their agreement confirms nothing; "" without two such rows.
 
     Incremental mapping, global mapping and triangulation each give initial poses from part of the tracks; the final
-    model is one bundle adjustment of all tracks from there (service/compute/poses/sfm/model/mapping.py).
+    model is one bundle adjustment of all tracks from there (service/compute/sfm/child.py).
     """
     if not any(
         job.kind == structure_from_motion.KIND.name

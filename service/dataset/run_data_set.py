@@ -15,8 +15,8 @@ from drivers.meshes.companions import companion_names
 from drivers.meshes.foreign_text import alike
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import WorldSphere, hull_mask
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.splits import splits
+from service.compute.pixels.render import RayMesh
+from service.compute.pixels.views import splits
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse
 from service.core.picture_files import PNG_BEGINS

@@ -12,7 +12,7 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.ply import read_ply
+from service.compute.ground_truth.surface import read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply
 from service.core.protocol.models import Protocol

@@ -20,7 +20,7 @@ from pathlib import Path
 import psutil
 from pydantic import ValidationError
 
-from service.compute.machine_memory import MachineMemory, machine_memory
+from service.compute.resources import MachineMemory, machine_memory
 from service.core.errors import ComputeError
 from service.core.records.events import Record
 from service.core.units import megabytes

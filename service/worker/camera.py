@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.compute.camera_covariance import CameraCovariance
-from service.compute.camera_model import CameraModel
-from service.compute.images.resolution import camera_at
+from service.compute.camera_model import CameraCovariance, CameraModel
+from service.compute.pixels.resample import camera_at
 from service.core.geometry import Array
 from service.jobs.records import Camera, ImagesCamera, Matrix, ParameterCovariance
 

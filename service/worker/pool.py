@@ -21,8 +21,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
-from service.compute.memory import keep_freed_memory
-from service.compute.priority import compute_in_background
+from service.compute.resources import compute_in_background, keep_freed_memory
 from service.core.jobs.priorities import Lane
 from service.logs.file_log import file_log
 from service.logs.terminal import show_own_words_only

@@ -12,10 +12,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.compute.arm.inverse_kinematics import postures, postures_near
-from service.compute.arm.kinematics import chain, dh_jacobian, forward
-from service.compute.planning.collision import Capsule, link_segments, nearest_contacts
-from service.compute.planning.detour import PATH_STEP_RAD
+from service.compute.arm_kinematics import chain, dh_jacobian, forward, postures, postures_near
+from service.compute.planning.collision import PATH_STEP_RAD, Capsule, link_segments, nearest_contacts
 from service.compute.planning.motion_plan import (
     PlanningScene,
     able_postures,

@@ -18,7 +18,7 @@ from service.benchmark.methods import Workplace, methods, missing
 from service.benchmark.records import BenchmarkResult, read_results
 from service.benchmark.running import Trial, run_trial
 from service.benchmark.table import figure_png, table_markdown, table_record
-from service.compute.ground_truth.distances.chamfer import ChamferSettings
+from service.compute.ground_truth.chamfer import ChamferSettings
 from service.core.errors import ComputeError, ConfigurationError, DataError, OrthocaptureError
 from service.core.geometry import apply, inverse
 from service.dataset.exported import data_set_of_folder, scaled_data_set

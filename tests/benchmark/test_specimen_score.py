@@ -9,9 +9,8 @@ import pytest
 import trimesh
 
 from bench.reconstruction.specimen import score_specimen, specimen_of
-from service.compute.ground_truth.fusion.cut_out import Markers
-from service.compute.ground_truth.ply import write_ply
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.fuse import Markers
+from service.compute.ground_truth.surface import Surface, write_ply
 from service.dataset.records import Mesh
 
 CENTRE_M = np.array([0.0, 0.0, 0.03])

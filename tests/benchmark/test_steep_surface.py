@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.ground_truth.surface import Surface
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.stereo.pairs import StereoView
-from service.compute.stereo.steep.choice import averaged, beliefs, edges_of
-from service.compute.stereo.steep.complete import completed
-from service.compute.stereo.steep.evidence import best_views, evidence, photograph, seen_through
-from service.compute.stereo.steep.relaxed import relaxed
+from service.compute.pixels.render import RayMesh
+from service.compute.stereo.rectify import StereoView
+from service.compute.stereo.steep import (
+    averaged,
+    beliefs,
+    best_views,
+    completed,
+    edges_of,
+    evidence,
+    photograph,
+    relaxed,
+    seen_through,
+)
 from service.core.geometry import Array, Transform, look_at
 
 CAMERA = CameraModel(400, 300, 600.0, 600.0, 199.5, 149.5)

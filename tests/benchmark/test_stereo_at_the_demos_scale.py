@@ -10,7 +10,7 @@ from bench.reconstruction.simulated import simulated_data_set
 from bench.scenes import render_scene
 from service.benchmark.methods import methods
 from service.benchmark.running import Trial, run_trial
-from service.compute.ground_truth.distances.chamfer import ChamferSettings
+from service.compute.ground_truth.chamfer import ChamferSettings
 
 SCENE, WIDTH_PX, VIEWS = 7, 1280, 16
 

@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.intrinsics import adjustment
-from service.compute.calibration.intrinsics.adjustment import LensModel
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics, locate_view
-from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
-from service.compute.calibration.intrinsics.validation import calibration_warnings, cross_validate
+from service.compute.board.board import Board, BoardView
 from service.compute.camera_model import CameraModel
+from service.compute.intrinsics import adjustment
+from service.compute.intrinsics.adjustment import LensModel
+from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics, locate_view
+from service.compute.intrinsics.uncertainty import (
+    board_distance_m,
+    calibration_warnings,
+    cross_validate,
+    projection_uncertainty,
+)
 from service.core.geometry import Array, apply, inverse, look_at, transform
 from service.jobs.calibration.records import BoardSeen
 from service.worker.calibration.records import intrinsics_record, seen_board

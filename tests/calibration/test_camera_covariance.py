@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.reprojection import BoardCorners
-from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
-from service.compute.camera_model import CameraModel
-from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
-from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, moved, normal_equations
-from service.compute.poses.hybrid.rows import linearise
-from service.compute.poses.sfm.tracks import Tracks
+from service.compute.camera_model import CameraCovariance, CameraModel, read_camera_covariance
+from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.hand_eye.reprojection import BoardCorners
+from service.compute.hybrid.bundle import AdjustmentData, BundleState, Sigmas, linearise, moved, normal_equations
+from service.compute.sfm.estimate import blocks, similarity_covariance
+from service.compute.sfm.features import Tracks
 from service.core.errors import DataError
 from service.core.geometry import Array, align_points
 from tests.support.boards.board_sessions import BOARD, CAMERA, T_FLANGE_CAMERA, locate, noisy_session

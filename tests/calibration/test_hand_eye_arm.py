@@ -15,9 +15,8 @@ from typer.testing import CliRunner
 from bench.calibration.arm_errors import one as hand_eye_of
 from bench.calibration.arm_errors import seen_from_nominal_flange
 from service.cli.calibrate import calibrate_app
-from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
-from service.compute.arm.joint_file import read_joints_csv
-from service.compute.arm.kinematics import (
+from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
+from service.compute.arm_kinematics import (
     chain,
     dh_jacobian,
     forward,
@@ -25,13 +24,12 @@ from service.compute.arm.kinematics import (
     parallel_jacobian,
     solve_joints,
 )
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.plan import suggest_board_poses
-from service.compute.calibration.board_poses.plan_plot import draw_board_plan
-from service.compute.calibration.hand_eye.answers import HandEyeResult
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.reprojection import BoardCorners
-from service.compute.poses.files.pose_files import write_poses_csv
+from service.compute.board.board import Board
+from service.compute.board.next_poses import draw_board_plan, suggest_board_poses
+from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.hand_eye.reprojection import BoardCorners
+from service.compute.poses.pose_files import write_poses_csv
+from service.compute.poses.robot_files import read_joints_csv
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError, DataError

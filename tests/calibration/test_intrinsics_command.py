@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.intrinsics.optics import Optics, compare_optics
+from service.compute.board.board import Board
 from service.compute.camera_model import CameraModel
-from service.compute.poses.files.camera_files import read_camera_json
+from service.compute.intrinsics.optics import Optics, compare_optics
+from service.compute.poses.camera_files import read_camera_json
 from service.core.errors import DataError
 from service.core.geometry import transform
 from service.core.protocol.models import load_protocol

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.compute.calibration.hand_eye.board_size import BoardSizeFound
-from service.compute.registration.identification.other_scale import words_of_unit
+from service.compute.hand_eye.uncertainty import BoardSizeFound
+from service.compute.registration.identity import words_of_unit
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.units import MISTAKEN_LENGTHS, mistaken_length

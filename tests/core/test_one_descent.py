@@ -14,15 +14,15 @@ SOLVE = {"np.linalg.solve", "np.linalg.lstsq"}
 DESCENT = {"gauss_newton", "halved_gauss_newton", "levenberg_marquardt"}
 
 OWN_LOOPS = {
-    "evaluation/closure.py": "chooses inliers before each step, and keeps the equations of the last",
-    "markers/outlines/limb.py": "estimates noise, selection and priors again before each step",
-    "markers/outlines/refine.py": "reweights equations that are linear",
-    "poses/hybrid/estimate.py": "solves once for each camera, and iterates nothing",
-    "poses/sfm/model/track_building.py": "reweights equations that are linear, for the start of a descent",
+    "evaluation/error_budget.py": "chooses inliers before each step, and keeps the equations of the last",
+    "markers/limb.py": "estimates noise, selection and priors again before each step",
+    "markers/refine.py": "reweights equations that are linear",
+    "hybrid/estimate.py": "solves once for each camera, and iterates nothing",
+    "sfm/track_building.py": "reweights equations that are linear, for the start of a descent",
     "registration/solve.py": "whitens residuals, to reweight the next descent",
-    "surfaces/loop_closure.py": "removes one outlier at a time, and tests each against a fit of the others",
-    "surfaces/spheres/rough_fits.py": "does the same for hundreds of candidates at once",
-    "surfaces/spheres/tukey.py": "shrinks the band of samples with the residuals",
+    "surfaces/constellations.py": "removes one outlier at a time, and tests each against a fit of the others",
+    "surfaces/sphere_candidates.py": "does the same for hundreds of candidates at once",
+    "surfaces/sphere_fit.py": "shrinks the band of samples with the residuals",
 }
 
 

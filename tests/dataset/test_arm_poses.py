@@ -10,7 +10,7 @@ import pytest
 
 from service.audit.record.run import RecordedRun, read_run
 from service.audit.replay.recomputed import ScratchStore
-from service.compute.matching.pairs.relative_pose import relative_covariance
+from service.compute.matching.pairs import relative_covariance
 from service.core.run.state import JobState
 from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import RunSummary

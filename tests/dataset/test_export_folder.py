@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image_of
+from service.compute.images.photographs import read_image_of
 from service.compute.pixels.masks import hull_mask
 from service.core.errors import ConfigurationError, DataError
 from service.dataset.export_folder import ExportFolder, export_folder

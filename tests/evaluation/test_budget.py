@@ -10,17 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.evaluation.closure import Alignment, compare_in_frame, compare_shapes, locate_in_images
 from service.compute.evaluation.error_budget import (
+    Alignment,
     ErrorBudget,
     MeasuredSpheres,
     Observation,
+    compare_in_frame,
+    compare_shapes,
     contributions,
     control_observation,
+    locate_in_images,
     loop_observations,
 )
 from service.compute.pipeline import register_images
-from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform

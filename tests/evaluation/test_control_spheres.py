@@ -15,9 +15,9 @@ from service.compute.evaluation.control_spheres import (
     evaluate_controls,
 )
 from service.compute.markers.cones import cone_of_sphere
+from service.compute.markers.predicted import find_nearby
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.nearby import find_nearby
-from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse
 from tests.support.scenes.sphere_images import (

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, radial_errors_m, true_error_m
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.settings import RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.identity import Assignment
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import inverse, transform

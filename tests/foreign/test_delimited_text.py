@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from service.compute.arm.joint_file import read_joints_csv
-from service.compute.poses.files.pose_files import read_poses
-from service.compute.poses.files.robot_files import read_stations
+from service.compute.poses.pose_files import read_poses
+from service.compute.poses.robot_files import read_joints_csv, read_stations
 from service.core.delimited_text import TextTable, read_table
 from service.core.errors import DataError
 

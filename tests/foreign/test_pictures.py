@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from drivers.photos.photo_folder import list_photographs
-from service.compute.images.files import image_size, read_grey, read_image
-from service.compute.images.folder import image_folder
+from service.compute.images.photographs import image_folder, image_size, read_grey, read_image
 from service.core.errors import DataError
 from service.core.jpeg_damage import damaged_jpegs
 from service.core.picture_files import kind_of

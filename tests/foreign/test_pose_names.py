@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.images.folder import ImageFolder
-from service.compute.poses.files.pose_files import posed_images, read_poses
+from service.compute.images.photographs import ImageFolder
+from service.compute.poses.pose_files import posed_images, read_poses
 from service.core.errors import DataError
 
 A = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1.0]])

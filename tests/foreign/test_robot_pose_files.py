@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.poses.files.robot_poses import matched_rows, read_robot_poses
+from service.compute.poses.robot_files import matched_rows, read_robot_poses
 from service.core.errors import DataError
 from service.core.geometry import Array
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.further_cameras.pose import (
+from service.compute.registration.further_camera import (
     FurtherPose,
     OuterFrame,
     SightedPose,

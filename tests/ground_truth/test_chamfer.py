@@ -17,12 +17,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.ground_truth.distances import chamfer as compared
-from service.compute.ground_truth.distances import sampling
-from service.compute.ground_truth.distances.chamfer import ChamferSettings, chamfer
-from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.sampling import sample
-from service.compute.ground_truth.distances.triangle_tree import TriangleTree
+from service.compute.ground_truth import chamfer as compared
+from service.compute.ground_truth.chamfer import ChamferSettings, chamfer, sample
+from service.compute.ground_truth.distances import PointIndex, TriangleTree
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
@@ -138,7 +135,7 @@ def shuffled(of: Surface) -> Surface:
 def test_of_many_samples_some_are_compared_with_all_in_whatever_order_the_faces_are(
     monkeypatch: pytest.MonkeyPatch, ordered: bool
 ) -> None:
-    monkeypatch.setattr(sampling, "_BLOCK", 300)
+    monkeypatch.setattr(compared, "_BLOCK", 300)
     monkeypatch.setattr(compared, "MOST_COMPARED", 1000)
     pred, gt = shifted(plane(cells=60), (0.002, 0.0005, -0.0003)), plane(cells=50)
     if not ordered:
@@ -160,10 +157,10 @@ def test_of_many_samples_some_are_compared_with_all_in_whatever_order_the_faces_
 def test_regions_hold_each_sample_once_and_those_together_that_lie_together(
     monkeypatch: pytest.MonkeyPatch, ordered: bool
 ) -> None:
-    monkeypatch.setattr(sampling, "_BLOCK", 100)
+    monkeypatch.setattr(compared, "_BLOCK", 100)
     of = plane(cells=60) if ordered else shuffled(plane(cells=60))
     whole = sample(of, 2e-4, np.random.default_rng(3))
-    regions = list(sampling.BlockedSamples(of, 2e-4, np.random.default_rng(3)).regions())
+    regions = list(compared.BlockedSamples(of, 2e-4, np.random.default_rng(3)).regions())
     assert [len(region.origin) for region in regions] == 6 * [400]
     points, origin = (
         np.concatenate([getattr(region, name) for region in regions]) for name in ("points_m", "origin")

@@ -14,12 +14,25 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from service.compute.ground_truth.frames import close_transforms, distance_changes
-from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
-from service.compute.ground_truth.fusion.deviation import moved_unfolded
-from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
-from service.compute.ground_truth.fusion.overlap import overlap, rim_vertices
-from service.compute.ground_truth.fusion.regions import Box, Prism, RegionCorrection, corrected, outline
+from service.compute.ground_truth.align import close_transforms, distance_changes
+from service.compute.ground_truth.fuse import (
+    Fused,
+    FusionSettings,
+    Markers,
+    Source,
+    fuse,
+    moved_unfolded,
+    without_markers,
+)
+from service.compute.ground_truth.overlap import (
+    Box,
+    Prism,
+    RegionCorrection,
+    corrected,
+    outline,
+    overlap,
+    rim_vertices,
+)
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, transform

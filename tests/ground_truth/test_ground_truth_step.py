@@ -14,8 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import CtSource, DeviceIdentity, DeviceReport, Mesh, ScanExport, ScannedMesh, Scanner
-from service.compute.ground_truth.ply import read_ply
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.surface import Surface, read_ply
 from service.core.errors import ProtocolError
 from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol

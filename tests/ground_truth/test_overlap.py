@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.fusion.overlap import Mask, OverlapLimits, WoundLimits, overlap, propose_wound
+from service.compute.ground_truth.overlap import Mask, OverlapLimits, WoundLimits, overlap, propose_wound
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import transform
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.compute.planning.coverage import CoverageLimits
-from service.compute.planning.information import predicted_information
+from service.compute.planning.next_views import predicted_information
 from service.core.geometry import apply, inverse
 from service.jobs.capture import hand_view as job
 from service.jobs.records import Camera, Limits

@@ -37,10 +37,10 @@ EDGES = {
     "service/store/verification/signature_checks.py": "checks rows that may be altered and no longer records",
     "service/audit/verify/bundle_verifier.py": "stands alone in a bundle, with nothing but the standard library",
     # files
-    "service/compute/capture/hand_bundle.py": "writes and reads the file of a hand-held image",
-    "service/compute/markers/archive.py": "writes and reads files of outlines",
+    "service/compute/hand_held.py": "writes and reads the file of a hand-held image",
+    "service/compute/markers/records.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
-    "service/compute/poses/files/camera_files.py": "reads JSON files",
+    "service/compute/poses/camera_files.py": "reads JSON files",
     "service/core/protocol/models.py": "the JSON schema of a protocol",
     "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",
@@ -51,9 +51,8 @@ EDGES = {
     "service/worker/capture/held_images.py": "writes and reads the file of a hand-held image",
     "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
-    "service/compute/poses/colmap/process.py": "messages of a child process",
-    "service/compute/poses/sfm/model/adjustment.py": "messages of a child process",
-    "service/compute/poses/sfm/model/mapping.py": "messages of a child process",
+    "service/compute/sfm/colmap_process.py": "messages of a child process",
+    "service/compute/sfm/child.py": "messages of a child process",
     # JSON that commands print
     "service/cli/evaluate.py": "prints JSON",
     "service/cli/fuse.py": "prints JSON",

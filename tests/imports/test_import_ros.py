@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board.board import Board
-from service.compute.poses.files.pose_files import read_poses_csv
+from service.compute.board.board import Board
+from service.compute.poses.pose_files import read_poses_csv
 from service.core.geometry import Array, inverse, transform
 from tests.support.boards.board_folder import CAMERA, T_FLANGE_CAMERA, BoardFolder, board_folder
 

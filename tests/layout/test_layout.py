@@ -18,10 +18,9 @@ from bench.registration.layout_gate import judge
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import REQUIRED_MARGIN_M, check_layout
+from service.compute.layout.moves import Move, show_move, suggest_moves
 from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
 from service.compute.layout.photographs import layout_from_photographs
-from service.compute.layout.sphere_moves import Move, suggest_moves
-from service.compute.layout.words import show_move
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse, transform

@@ -13,10 +13,17 @@ from numpy.typing import NDArray
 
 from bench.markers.detectors import main
 from service.compute.markers.detect import detect_spheres
-from service.compute.markers.grounded.boxes import LAST_THRESHOLD, find_boxes, normalised, tiles_of
-from service.compute.markers.grounded.detector import GroundedDetector, voted
-from service.compute.markers.grounded.networks import DEVIATION, MEAN, Floats, Networks, load_networks
-from service.compute.markers.grounded.weights import VARIABLE, Weights, weights_in
+from service.compute.markers.grounded import LAST_THRESHOLD, GroundedDetector, find_boxes, normalised, tiles_of, voted
+from service.compute.markers.grounded_networks import (
+    DEVIATION,
+    MEAN,
+    VARIABLE,
+    Floats,
+    Networks,
+    Weights,
+    load_networks,
+    weights_in,
+)
 from service.core.errors import ConfigurationError, DataError
 from tests.support.grounded_weights import tiny_weights
 from tests.support.scenes.sphere_images import CONTROL_M, REGISTRATION_M, exact_outlines, render, scene

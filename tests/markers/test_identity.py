@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import identify, identify_each
+from service.compute.registration.identity import identify, identify_each
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform

@@ -13,22 +13,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.evaluation.accuracy import true_error_m
-from service.compute.images.files import read_image, read_reduced
-from service.compute.markers.cones import cone_of_sphere
+from service.compute.images.photographs import read_image, read_reduced
+from service.compute.markers.cones import ObservedCones, cone_of_sphere, fit_pose
 from service.compute.markers.detect import detect_spheres
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.image_files import LocatedOutlines, detect_all, locate_outlines, spread_views
+from service.compute.markers.predicted import NEAR, WIDE, PredictedSpheres, locate_predicted, tone_of, visible_cones
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.anchors import spread_views
-from service.compute.markers.search.cone_pose import fit_pose
-from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines
-from service.compute.markers.search.predicted import (
-    NEAR,
-    WIDE,
-    PredictedSpheres,
-    locate_predicted,
-    tone_of,
-    visible_cones,
-)
 from service.compute.pipeline import PipelineResult, register_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError

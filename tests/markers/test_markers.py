@@ -13,13 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.archive import outline_from_record, outline_record
-from service.compute.markers.colours import chromaticity, learn_colour
 from service.compute.markers.cones import Cone, angles_to, cone_ellipse, cone_of_sphere, fit_cone, ransac_cone
-from service.compute.markers.detect import detect_spheres
-from service.compute.markers.detectors import options_for
-from service.compute.markers.outlines.refine import approach_outlines, refine_outline
-from service.compute.markers.records import DetectionOptions, SphereOutline
+from service.compute.markers.detect import detect_spheres, options_for
+from service.compute.markers.records import (
+    DetectionOptions,
+    SphereOutline,
+    chromaticity,
+    learn_colour,
+    outline_from_record,
+    outline_record,
+)
+from service.compute.markers.refine import approach_outlines, refine_outline
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 from tests.support.scenes.sphere_conditions import COLOURS_BGR, Look, render_look

@@ -9,9 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.markers.detectors import DETECTORS
-from service.compute.markers.paper_chain import detect_by_masks, find_boxes, fit_ellipse, sphere_mask
-from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
+from service.compute.markers.detect import DETECTORS
+from service.compute.markers.paper import (
+    detect_by_masks,
+    detect_file_by_masks,
+    find_boxes,
+    fit_ellipse,
+    read_boxes,
+    sphere_mask,
+)
 from service.core.errors import DataError
 from tests.support.scenes.sphere_images import CONTROL_M, REGISTRATION_M, exact_outlines, render, scene
 

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from service.benchmark.matching_results import read_result, record
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
+from service.compute.matching.loader import MatchingData
 from service.compute.matching.methods.method import GROUP
-from service.compute.matching.pairs.loader import MatchingData
 from service.core.geometry import Array
 from service.dataset.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set

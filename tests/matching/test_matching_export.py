@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.matching.pairs.difficulty import CLASSES
-from service.compute.matching.pairs.loader import VISIBLE, MatchingData
-from service.compute.matching.pairs.relative_pose import relative_covariance
+from service.compute.matching.loader import VISIBLE, MatchingData
+from service.compute.matching.pairs import CLASSES, relative_covariance
 from service.core.geometry import Array, apply, inverse
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.pixels import undistorted_data_set

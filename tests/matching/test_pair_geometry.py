@@ -11,12 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.compute.camera_model import CameraModel
-from service.compute.matching.pairs.covisibility import covisibility, points_seen
-from service.compute.matching.pairs.difficulty import CLASSES, Difficulty, difficulty
-from service.compute.matching.pairs.loader import OCCLUDED, OUTSIDE, UNKNOWN, VISIBLE, View, correspondences, look_up
-from service.compute.matching.pairs.relative_pose import relative_covariance, relative_pose
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.render import depth_map
+from service.compute.matching.loader import OCCLUDED, OUTSIDE, UNKNOWN, VISIBLE, View, correspondences, look_up
+from service.compute.matching.pairs import (
+    CLASSES,
+    Difficulty,
+    covisibility,
+    difficulty,
+    points_seen,
+    relative_covariance,
+    relative_pose,
+)
+from service.compute.pixels.render import RayMesh, depth_map
 from service.core.geometry import Array, Transform, apply, increment, inverse, look_at
 from tests.support.scenes.posed import UP, reach, scene
 

@@ -11,19 +11,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.matching.loader import VISIBLE, View, correspondences
 from service.compute.matching.methods.method import Matches
-from service.compute.matching.pairs.loader import VISIBLE, View, correspondences
-from service.compute.matching.pairs.relative_pose import relative_pose
-from service.compute.matching.scores.matches import (
+from service.compute.matching.pairs import relative_pose
+from service.compute.matching.scores import (
     PRECISION_PX,
+    auc,
     epipolar_errors_px,
     fundamental_matrix,
     match_errors_px,
+    pose_error,
+    pose_from_matches,
     precisions,
 )
-from service.compute.matching.scores.pose import auc, pose_error, pose_from_matches
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.render import depth_map
+from service.compute.pixels.render import RayMesh, depth_map
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at
 from tests.support.scenes.posed import UP, scene

@@ -17,8 +17,7 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.compute.images.develop import Developed, coded, develop, eight_bits, read_developed
-from service.compute.images.match import find_shift
+from service.compute.images.develop import Developed, coded, develop, eight_bits, find_shift, read_developed
 from service.core.errors import ConfigurationError, DataError
 from simulators.rendering.sensor import EXPOSED, bordered, camera_picture, read_out
 from simulators.sony_camera.exif import PLATE

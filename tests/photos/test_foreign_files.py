@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.photos.photo_file import read_exif
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 
 
 def shipped(package: str, name: str) -> Path:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.compute.images.quality import image_quality
+from service.compute.images.photographs import image_quality
 from service.steps.capture.spoilt import IN_A_ROW, ImageSharpness, last_in_a_row, why_spoilt
 from tests.support.scenes.sphere_images import REGISTRATION_M, render, scene
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import check_jpeg_complete
-from service.compute.images.files import image_size, read_grey
+from service.compute.images.photographs import image_size, read_grey
 from service.core.errors import DataError
 from service.core.picture_files import picture_size
 from service.web.record.pictures import reduced_jpeg

@@ -13,8 +13,8 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board.board import Board
-from service.compute.images.folder import image_folder
+from service.compute.board.board import Board
+from service.compute.images.photographs import image_folder
 from service.core.errors import DataError
 from tests.support.boards.board_folder import CAMERA, BoardFolder, board_folder
 

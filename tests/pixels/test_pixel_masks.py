@@ -12,13 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.crops import ImageCrop, marker_free_crops
 from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask, posts_below
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.rays import pixel_rays
-from service.compute.pixels.render import depth_map, seen
-from service.compute.pixels.splits import splits
-from service.compute.pixels.undistort import pinhole_of, undistorted
+from service.compute.pixels.render import RayMesh, depth_map, pixel_rays, seen
+from service.compute.pixels.resample import pinhole_of, undistorted
+from service.compute.pixels.views import ImageCrop, marker_free_crops, splits
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, apply, inverse, look_at
 

@@ -10,8 +10,7 @@ import pytest
 
 from service.audit.record.run import RecordedFiles
 from service.audit.replay.recomputed import ScratchStore
-from service.compute.poses.sfm.options import SfmOptions
-from service.compute.poses.sfm.pairs import pairs_of
+from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.records.events import ArtefactRef
 from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS

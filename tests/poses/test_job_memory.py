@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.compute.machine_memory import MachineMemory, machine_memory, processes_for
+from service.compute.resources import MachineMemory, machine_memory, processes_for
 from service.core.errors import ComputeError, IllegalTransitionError
 from service.core.records.events import JobFailed
 from service.jobs import job_kinds

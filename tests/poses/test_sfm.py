@@ -10,12 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, reconstruct_from
-from service.compute.poses.sfm.extraction import extract_sift
-from service.compute.poses.sfm.features import ImageFeatures, pack_matches, unpack_matches
-from service.compute.poses.sfm.front_end import FrontEnd, missing_pairs
-from service.compute.poses.sfm.options import SfmOptions
-from service.compute.poses.sfm.pairs import choose_pairs, pairs_of
+from service.compute.sfm.colmap import extract_sift
+from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, reconstruct_from
+from service.compute.sfm.features import ImageFeatures, pack_matches, unpack_matches
+from service.compute.sfm.front_end import FrontEnd, missing_pairs
+from service.compute.sfm.options import SfmOptions, choose_pairs, pairs_of
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Transform, align_points, apply, inverse, transform
 from tests.support.record.counting import lines_of

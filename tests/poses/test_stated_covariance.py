@@ -9,8 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.sparse import csr_matrix
 
-from service.compute.poses.hybrid.bundle import Rows, normal_equations
-from service.compute.poses.hybrid.stated_covariance import (
+from service.compute.hybrid.adjustment import (
     CAUCHY,
     EXPECTED,
     clustered_information,
@@ -19,6 +18,7 @@ from service.compute.poses.hybrid.stated_covariance import (
     stated_covariance,
     taken_by_points,
 )
+from service.compute.hybrid.bundle import Rows, normal_equations
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.matching.pairs.relative_pose import relative_covariance, relative_pose
-from service.compute.registration.camera_errors import camera_errors
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.settings import CommonErrors, RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.matching.pairs import relative_covariance, relative_pose
+from service.compute.registration.cost import CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment
+from service.compute.registration.pose_errors import camera_errors
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse, transform

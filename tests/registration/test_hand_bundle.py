@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.compute.capture.hand_bundle import AdjustedCapture, ImageReading, adjust_together
+from service.compute.hand_held import AdjustedCapture, ImageReading, adjust_together
 from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, rotation_angle_rad
 from tests.support.runs.measuring_rig import SPHERES_M
 from tests.support.scenes.sphere_images import Scene, camera, exact_outlines

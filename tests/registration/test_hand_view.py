@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.compute.capture.hand_view import HandView, look_at_image
+from service.compute.hand_held import HandView, look_at_image
 from service.compute.markers.records import DEFAULTS
 from service.core.geometry import Array, inverse, look_at, rotation_angle_rad
 from tests.support.runs.measuring_rig import SPHERES_M
@@ -34,7 +34,7 @@ def look(
     def detected(*_args: Any) -> Any:
         return outlines
 
-    monkeypatch.setattr("service.compute.capture.hand_view.detect_spheres", detected)
+    monkeypatch.setattr("service.compute.hand_held.detect_spheres", detected)
     image = np.full((CAMERA.height, CAMERA.width, 3), bright, dtype=np.uint8)
     return look_at_image(image, CAMERA, spheres_m, RADIUS_M, DEFAULTS, rough=rough)
 

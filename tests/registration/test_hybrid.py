@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.camera_covariance import CameraCovariance
-from service.compute.markers.observed_cones import ObservedCones
-from service.compute.poses.files.pose_covariance import similarity_covariance
-from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, moved, width
-from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
-from service.compute.poses.hybrid.rows import linearise
+from service.compute.camera_model import CameraCovariance
+from service.compute.hybrid.bundle import (
+    AdjustmentData,
+    BundleState,
+    Sigmas,
+    SphereSightings,
+    linearise,
+    moved,
+    width,
+)
+from service.compute.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
+from service.compute.markers.cones import ObservedCones
 from service.compute.scene import PosedImages
+from service.compute.sfm.estimate import similarity_covariance
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, inverse, transform
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION, REGISTRATION_M

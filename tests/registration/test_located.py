@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.compute.capture.located import poses_by_spheres
+from service.compute.hand_held import poses_by_spheres
 from service.compute.markers.records import SphereOutline
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError

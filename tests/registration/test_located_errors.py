@@ -15,9 +15,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.archive import outline_record
-from service.compute.markers.records import SphereOutline
-from service.compute.registration.settings import EXPECTED_COMMON_ERRORS
+from service.compute.markers.records import SphereOutline, outline_record
+from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
 from service.core.geometry import Array, Transform, inverse
 from service.jobs.registration import register
 from service.store.store import Store

@@ -10,13 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.observed_cones import ObservedCones
+from service.compute.markers.cones import ObservedCones, cone_of_sphere
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.least_squares.cost import Cost, PointCost, residuals, residuals_and_derivative
-from service.compute.registration.settings import RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.cost import (
+    Cost,
+    PointCost,
+    RegistrationSettings,
+    residuals,
+    residuals_and_derivative,
+)
+from service.compute.registration.identity import Assignment
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Transform, apply, inverse, rotation_angle_rad, transform

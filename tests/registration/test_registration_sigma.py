@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.identification.identity import Assignment, identify
-from service.compute.registration.settings import CommonErrors, RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.cost import CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, skew, transform

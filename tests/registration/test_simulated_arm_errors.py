@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.camera_errors import camera_errors
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.settings import CommonErrors, RegistrationSettings
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.cost import CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment
+from service.compute.registration.pose_errors import camera_errors
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, look_at, transform
 from simulators.scene.world import Scene as Laboratory

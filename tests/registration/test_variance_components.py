@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from service.compute.registration.least_squares.normal_equations import (
+from service.compute.registration.problem import (
     Blocks,
     compress,
     inverse_symmetric,
@@ -18,7 +18,7 @@ from service.compute.registration.least_squares.normal_equations import (
     pose_errors,
     solve_symmetric,
 )
-from service.compute.registration.least_squares.variance_components import (
+from service.compute.registration.solve import (
     PoseNoise,
     estimate,
     free_poses,

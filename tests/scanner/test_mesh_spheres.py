@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from service.compute.surfaces.constellations import match_constellations
-from service.compute.surfaces.loop_closure import close_loop
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
+from service.compute.surfaces.constellations import close_loop, match_constellations
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, apply, inverse, transform
 

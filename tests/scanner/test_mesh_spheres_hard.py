@@ -13,10 +13,9 @@ from typer.testing import CliRunner
 
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.main import app
-from service.compute.poses.files.camera_files import read_spheres_json
-from service.compute.surfaces.constellations import match_constellations
-from service.compute.surfaces.loop_closure import close_loop
-from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, locate_spheres
+from service.compute.poses.camera_files import read_spheres_json
+from service.compute.surfaces.constellations import close_loop, match_constellations
+from service.compute.surfaces.mesh_spheres import MeshSphere, locate_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from tests.support.scenes.sphere_meshes import RADIUS_M, MeshBuilder, cap, clutter, scattered_centres

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import Scanner
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
-from service.compute.surfaces.part_merging import merge_parts
+from service.compute.surfaces.constellations import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import StepFailed

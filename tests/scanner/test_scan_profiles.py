@@ -24,8 +24,7 @@ from drivers.errors import DeviceError, DriverMissingError, IncompleteExportErro
 from drivers.interfaces import ScannedMesh
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from drivers.scan_profiles import profile_named, profile_names
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
-from service.compute.surfaces.spheres.wrong_unit import wrong_unit
+from service.compute.surfaces.mesh_spheres import locate_spheres, wrong_unit
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.store.store import Store

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import CameraSettings
-from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
-from service.compute.arm.inverse_kinematics import postures
-from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
-from service.compute.markers.search.predicted import NEAR, ImageOutlines, PredictedSpheres, find_outlines, tone_of
+from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
+from service.compute.arm_kinematics import postures
+from service.compute.live import LiveView, clipped_fraction, register_station, sharpness
+from service.compute.markers.predicted import NEAR, ImageOutlines, PredictedSpheres, find_outlines, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
 )
-from service.compute.registration.identification.pairing import paired
+from service.compute.registration.hypotheses import paired
 from service.core.arms.known import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote

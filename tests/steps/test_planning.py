@@ -17,21 +17,25 @@ from hypothesis.extra.numpy import arrays
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.compute.arm.inverse_kinematics import nearest_posture, postures
-from service.compute.arm.kinematics import forward
-from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
-from service.compute.planning.collision import Capsule, nearest_contacts, straight_path
+from service.compute.arm_kinematics import forward, nearest_posture, postures
+from service.compute.planning.collision import (
+    Capsule,
+    nearest_contacts,
+    segment_box_distance_m,
+    segment_distance_m,
+    straight_path,
+)
 from service.compute.planning.motion_plan import (
     MotionPlan,
     PlanningScene,
     best_posture,
     best_postures,
+    depth_of_field,
     infeasible_reason,
     plan_motion,
     shortest_order,
     travel_times_s,
 )
-from service.compute.planning.optics import depth_of_field
 from service.core.arms.known import arm_model
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol.models import Motion, load_protocol

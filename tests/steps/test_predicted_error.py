@@ -19,18 +19,20 @@ from service.compute.planning.coverage import (
     covered_fraction,
     seen,
 )
-from service.compute.planning.information import (
+from service.compute.planning.next_views import (
+    CurrentInformation,
+    ViewGain,
     lens_covariance_of_pose,
     mounting_covariance,
+    next_best_views,
     point_sigmas_m,
     pose_covariance,
     pose_scatter,
     predicted_information,
     view_information,
 )
-from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.settings import CommonErrors, RegistrationSettings
+from service.compute.registration.cost import CommonErrors, RegistrationSettings
+from service.compute.registration.identity import Assignment
 from service.compute.registration.solve import register
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError

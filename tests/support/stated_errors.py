@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.compute.evaluation.accuracy import Evaluation
-from service.compute.evaluation.closure import Alignment
+from service.compute.evaluation.error_budget import Alignment
 from service.compute.registration.result import RegistrationResult
 from service.core.geometry import Array
 

@@ -15,7 +15,7 @@ from bench.torture.fuzz.targets.target import fault_of
 from bench.torture.fuzz.watch import Sweep
 from drivers.errors import UnreadableFileError
 from drivers.meshes.surface_file import read_surface_file
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.core.errors import DataError
 
 PARSERS = "tests.support.processes.faulty_parsers"

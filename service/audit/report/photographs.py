@@ -25,7 +25,7 @@ from service.audit.report.blocks import (
     utc,
 )
 from service.audit.report.scene import report_scene
-from service.compute.images.shown import decode_reduced
+from service.compute.images.photographs import decode_reduced
 from service.core.errors import DataError, IntegrityError
 from service.core.protocol.models import Step
 from service.core.records.entered import NoteTaken, about_rows

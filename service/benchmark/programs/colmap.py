@@ -13,9 +13,9 @@ from pathlib import Path
 import pycolmap
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_grey
-from service.compute.poses.files.pose_files import HALF_PIXEL
-from service.compute.stereo.pairs import StereoView
+from service.compute.images.photographs import read_grey
+from service.compute.poses.pose_files import HALF_PIXEL
+from service.compute.stereo.rectify import StereoView
 from service.core.errors import ComputeError, DataError, OrthocaptureError
 from service.core.geometry import transform
 

@@ -16,13 +16,12 @@ import pycolmap
 from numpy.typing import NDArray
 
 from service.benchmark.programs.colmap import views_of
-from service.compute.ground_truth.ply import write_ply
-from service.compute.images.files import read_image
-from service.compute.poses.files.pose_files import HALF_PIXEL
-from service.compute.stereo.fusion import fused
+from service.compute.ground_truth.surface import write_ply
+from service.compute.images.photographs import read_image
+from service.compute.poses.pose_files import HALF_PIXEL
+from service.compute.stereo.fusion import fused, surface_of
 from service.compute.stereo.matching import DepthMap
-from service.compute.stereo.pairs import StereoView
-from service.compute.stereo.surface import surface_of
+from service.compute.stereo.rectify import StereoView
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, inverse
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 
 from service.benchmark.programs.colmap import views_of
-from service.compute.ground_truth.ply import write_ply
-from service.compute.memory import keep_freed_memory
+from service.compute.ground_truth.surface import write_ply
+from service.compute.resources import keep_freed_memory
 from service.compute.stereo.reconstruct import reconstruct
 from service.core.errors import OrthocaptureError
 

@@ -9,17 +9,23 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.least_squares.cost import residuals
-from service.compute.registration.least_squares.normal_equations import (
+from service.compute.registration.cost import residuals
+from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import (
     compress,
     inverse_symmetric,
     marginalise,
     pose_errors,
     solve_symmetric,
 )
-from service.compute.registration.prediction import HeldOutRows, Prediction, held_out_rows, predict
-from service.compute.registration.result import RegistrationResult, Solution
+from service.compute.registration.result import (
+    HeldOutRows,
+    Prediction,
+    RegistrationResult,
+    Solution,
+    held_out_rows,
+    predict,
+)
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse

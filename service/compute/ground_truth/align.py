@@ -2,17 +2,88 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 
-from service.compute.evaluation.closure import compare_shapes
-from service.compute.ground_truth.frames import DistanceChange, distance_changes
+from service.compute.evaluation.error_budget import compare_shapes
+from service.compute.ground_truth.fuse import outside, without_specks
+from service.compute.ground_truth.overlap import SphereRegion
 from service.compute.ground_truth.surface import Surface
-from service.compute.surfaces.constellations import match_constellations
-from service.compute.surfaces.loop_closure import LoopClosure, close_loop
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
-from service.core.geometry import Array, Transform, apply
+from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
+from service.compute.surfaces.mesh_spheres import locate_spheres
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse, rotation_angle_rad
+
+
+@dataclass(frozen=True, slots=True)
+class TransformLoop:
+    """Comparison of T_scan_ct from the spheres with T_scan_ct from the images (CT to cameras, cameras to scan).
+
+    Attributes:
+        T_scan_scan: the way around the loop; the identity if both agree.
+        rotation_rad: of it.
+        rms_m, worst_m: displacement of the points that it was judged at.
+    """
+
+    T_scan_scan: Transform = field(repr=False)
+    rotation_rad: float
+    rms_m: float
+    worst_m: float
+
+
+def close_transforms(
+    T_scan_ct: Transform, T_world_scan: Transform, T_world_ct: Transform, points_scan_m: Array
+) -> TransformLoop:
+    """Go from the scan to the CT by the spheres, and back by the cameras.
+
+    Args:
+        T_scan_ct: from sphere to sphere.
+        T_world_scan, T_world_ct: image-based registrations of the two meshes.
+        points_scan_m: (N, 3) where the difference matters, such as the spheres or the specimen.
+    """
+    around = inverse(T_world_scan) @ T_world_ct @ inverse(T_scan_ct)
+    length = np.linalg.norm(apply(around, points_scan_m) - points_scan_m, axis=1)
+    return TransformLoop(around, rotation_angle_rad(around), float(np.sqrt(np.mean(length**2))), float(length.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceChange:
+    """Distances between spheres before and after the transport.
+
+    Attributes:
+        worst: the two spheres whose distance changed most.
+        worst_m: that change, without its sign: what the gate judges.
+        rms_m: of all changes.
+    """
+
+    worst: tuple[int, int]
+    worst_m: float
+    rms_m: float
+
+
+def distance_changes(before_m: Array, after_m: Array, pairs: Sequence[tuple[int, int]]) -> DistanceChange:
+    """Compare all distances between spheres; no registration is needed for it.
+
+    Args:
+        before_m: (M, 3) centres in one frame.
+        after_m: (N, 3) centres in another.
+        pairs: (index before, index after) of the spheres that both hold.
+
+    Raises:
+        ComputeError: fewer than two common spheres.
+    """
+    if len(pairs) < 2:
+        raise ComputeError(f"{len(pairs)} common spheres have no distance", remedy="Scan all spheres")
+    a, b = (np.array([centres[pair[k]] for pair in pairs]) for k, centres in enumerate((before_m, after_m)))
+    both = tuple(combinations(range(len(pairs)), 2))
+    first, second = np.array(both).T
+    change = np.linalg.norm(b[first] - b[second], axis=1) - np.linalg.norm(a[first] - a[second], axis=1)
+    worst = int(np.abs(change).argmax())
+    return DistanceChange(both[worst], float(np.abs(change[worst])), float(np.sqrt(np.mean(change**2))))
+
 
 TRANSPORT_GATE_M = 3e-4  # largest change of a distance between spheres over the transport
 
@@ -92,3 +163,24 @@ def _located(surface: Surface, radius_m: float) -> MeshSpheres:
         np.array([s.covariance for s in found]),
         np.array([s.rms_m for s in found]),
     )
+
+
+_MARGIN_M = 0.001  # around a sphere that was taken away: the CT's surface beside it is drawn towards it
+# Smaller unconnected parts of the CT are noise, mostly in wood, whose density is near the threshold.
+_LEAST_PART_M2 = 5e-5
+
+
+@dataclass(frozen=True, slots=True)
+class CommonPart:
+    """A CT without the spheres that were taken away before the scan; `taken` is where they were."""
+
+    ct: Surface = field(repr=False)
+    taken: SphereRegion = field(repr=False)
+
+
+def common_part(ct: Surface, aligned: Aligned, radius_m: float) -> CommonPart:
+    """Leave out of a CT, in the scan's frame, the spheres of a radius that the scan lacks, and small loose parts."""
+    taken = SphereRegion(aligned.taken_away_m, radius_m + _MARGIN_M)
+    left = outside(ct, taken)
+    del ct
+    return CommonPart(without_specks(left, _LEAST_PART_M2), taken)

@@ -12,12 +12,12 @@ from service.compute.layout.confusions import (
     MOST_JUDGED,
     SUBSET,
     Confusions,
+    bounded_misfits,
     by_visible_count,
     confusions,
     distances,
     distinct,
 )
-from service.compute.layout.misfits import bounded_misfits
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.units import deg, mm

@@ -1,15 +1,16 @@
-"""The circular cone of rays of a sphere seen by a camera: three parameters, wherever it is in the image."""
+"""Describes the circular cone of rays of a sphere: its fit, its residuals, and a camera's pose from several."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.descent import gauss_newton
-from service.core.geometry import Array
+from service.core.geometry import Array, Transform, increment, skew
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,3 +193,110 @@ def ransac_cone(
     inlier = np.zeros(len(rays), dtype=bool)
     inlier[order] = inlier_sorted
     return cone, inlier
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedCones:
+    """O cones of spheres in the camera frame.
+
+    Attributes:
+        axes: (O, 3) unit vectors to the spheres' centres, which are not the ellipses' centres.
+        half_angles: (O,) radians.
+        directions: (O, 3, K) unit vectors, in columns, along which a tilt of the axis is measured.
+    """
+
+    axes: Array
+    half_angles: Array
+    directions: Array
+
+    @classmethod
+    def of(cls, cones: Iterable[Cone]) -> ObservedCones:
+        """With tilts along the first two columns of each cone's `frame()`, as in SphereOutline.cone_covariance."""
+        found = list(cones)
+        return cls(
+            np.array([c.axis for c in found], dtype=np.float64).reshape(-1, 3),
+            np.array([c.half_angle_rad for c in found], dtype=np.float64),
+            np.array([c.frame()[:, :2] for c in found], dtype=np.float64).reshape(-1, 3, 2),
+        )
+
+    @classmethod
+    def with_chords(cls, axes: Array, half_angles: Array) -> ObservedCones:
+        """Convert tilts to the camera's three axes, where they are differences of unit vectors."""
+        return cls(axes, half_angles, np.broadcast_to(np.eye(3), (len(axes), 3, 3)))
+
+    def __len__(self) -> int:
+        """Number of cones."""
+        return len(self.axes)
+
+    def take(self, which: NDArray[np.int64]) -> ObservedCones:
+        """The cones of these indices, which may repeat."""
+        return ObservedCones(self.axes[which], self.half_angles[which], self.directions[which])
+
+    def residuals(self, centres_camera_m: Array, radius_m: float) -> tuple[Array, Array]:
+        """Residuals (O, K + 1) in radians against spheres, and their derivative (O, K + 1, 3) by the centres.
+
+        Args:
+            centres_camera_m: (O, 3) predicted centres in the camera frame.
+            radius_m: radius of the spheres.
+
+        A sphere at c appears as the cone with the axis u = c / |c| and sin(a) = r / |c|. Its residual is the tilt of
+        u along the directions, and a minus the observed half angle. With two directions across the axis, these three
+        numbers hold all the information of an outline and are nearly linear in c.
+        """
+        distance = np.linalg.norm(centres_camera_m, axis=1)
+        u = centres_camera_m / distance[:, None]
+        half = np.arcsin(np.clip(radius_m / distance, 0.0, 0.999))
+        across = np.einsum("oik,oi->ok", self.directions, u - self.axes)
+        r = np.column_stack([across, half - self.half_angles])
+        tangent = np.eye(3) - u[:, :, None] * u[:, None, :]
+        tilt = np.einsum("oik,oij->okj", self.directions, tangent) / distance[:, None, None]
+        shrink = -np.tan(half)[:, None] * u / distance[:, None]
+        return r, np.concatenate([tilt, shrink[:, None, :]], axis=1)
+
+
+def fit_pose(
+    cones: ObservedCones, centres_m: Array, radius_m: float, start: Transform, iterations: int = 12
+) -> Transform:
+    """T_camera_scan from cones, by robust Gauss–Newton on their directions and sizes.
+
+    Args:
+        cones: N ≥ 3.
+        centres_m: (N, 3) of the spheres, scan frame.
+        radius_m: radius of the spheres.
+        start: initial T_camera_scan.
+        iterations: largest number.
+    """
+    seen = ObservedCones.with_chords(cones.axes, cones.half_angles)
+    try:
+        return gauss_newton(
+            start,
+            lambda pose: _pose_step(pose, seen, centres_m, radius_m),
+            lambda pose, step: increment(pose, step[:3], step[3:]),
+            most=iterations,
+            settled=1e-9,
+        )
+    except _InsideSphereError:
+        return start
+
+
+class _InsideSphereError(Exception):
+    """The camera would be inside a sphere."""
+
+
+def _pose_step(pose: Transform, seen: ObservedCones, centres_m: Array, radius_m: float) -> Array:
+    """One Gauss–Newton step (6,) of translation and rotation. Raises _InsideSphereError."""
+    rotated = centres_m @ pose[:3, :3].T
+    c = rotated + pose[:3, 3]
+    if np.any(np.linalg.norm(c, axis=1) < 1.5 * radius_m):
+        raise _InsideSphereError
+    r, slope = seen.residuals(c, radius_m)
+    residual = r / seen.half_angles[:, None]  # (N, 4) in radii
+    by_centre = slope / seen.half_angles[:, None, None]  # (N, 4, 3)
+    J = np.concatenate([by_centre, -by_centre @ skew(rotated)], axis=2)
+    error = np.linalg.norm(residual, axis=1)
+    scale = max(0.01, 1.5 * float(np.median(error)))
+    weight = 1 / (1 + (error / scale) ** 2)
+    H = np.einsum("n,nki,nkj->ij", weight, J, J)
+    g = np.einsum("n,nki,nk->i", weight, J, residual)
+    d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-12))
+    return -d * np.linalg.lstsq(H * np.outer(d, d), d * g, rcond=1e-12)[0]

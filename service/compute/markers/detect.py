@@ -1,29 +1,42 @@
-"""Detects spheres in one image: candidates, rough outlines, colour, then outlines at full resolution."""
+"""Detects spheres in one image, by the detector of a name: candidates, rough outlines, colour, full resolution."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.colours import ColourModel, given_colour, learn_colour
 from service.compute.markers.cones import Cone
-from service.compute.markers.outlines.candidates import CircleCandidate, colour_gradient, edges, find_candidates
-from service.compute.markers.outlines.refine import refine_outlines
-from service.compute.markers.outlines.rough import (
+from service.compute.markers.paper import detect_by_masks
+from service.compute.markers.records import (
+    DEFAULTS,
+    ColourModel,
+    DetectionOptions,
+    SphereOutline,
+    colour_of,
+    given_colour,
+    learn_colour,
+)
+from service.compute.markers.refine import refine_outlines
+from service.compute.markers.rough import (
     CLEAN_INTERIOR,
     CLEAR,
     LEAST_UNAIDED,
+    CircleCandidate,
     RoughSphere,
     apart_rad,
+    colour_gradient,
+    edges,
     examine,
+    find_candidates,
     outermost,
     share,
 )
-from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.core.errors import DataError
 from service.core.geometry import Array
 
@@ -264,3 +277,33 @@ def _learnt(roughs: list[RoughSphere], options: DetectionOptions) -> ColourModel
 
 def _distinct(a: SphereOutline, b: SphereOutline) -> bool:
     return apart_rad(a.cone, b.cone) > _DISTINCT * max(a.cone.half_angle_rad, b.cone.half_angle_rad)
+
+
+class Detector(Protocol):
+    """Finds the outlines of all spheres in an image (H, W, 3) of the camera's size."""
+
+    def __call__(
+        self, image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = ...
+    ) -> tuple[SphereOutline, ...]:
+        """The outlines, the most certain first."""
+        ...
+
+
+def options_for(colour: str | None, largest: float | None = None) -> DetectionOptions:
+    """Default options with the spheres' colour, by name or as #rrggbb; None: it is learnt from each image.
+
+    Args:
+        colour: of the spheres.
+        largest: largest radius searched for, over the image's width; None: the default.
+
+    Raises:
+        ConfigurationError: the colour is unknown.
+    """
+    options = DEFAULTS if largest is None else replace(DEFAULTS, max_radius=largest)
+    if colour is None:
+        return options
+    colour_bgr, tolerance = colour_of(colour)
+    return replace(options, colour_bgr=colour_bgr, colour_tolerance=tolerance)
+
+
+DETECTORS: Mapping[str, Detector] = {"classical": detect_spheres, "paper": detect_by_masks}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import cone_of_sphere
-from service.compute.pixels.rays import PixelRays, pixel_rays
+from service.compute.pixels.render import PixelRays, pixel_rays
 from service.core.geometry import Array, Transform, apply, inverse
 
 _AROUND = 96  # points of a circle

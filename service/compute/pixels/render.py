@@ -1,22 +1,205 @@
-"""Depth and normals of a mesh as a camera sees it, in tiles of rows, so that 60 million pixels need little memory.
-
-Works for distorted cameras and for undistorted ones: the depth of a pixel is that of the ray through its centre under
-the camera that is given. embreex finds the first face; depth and normal come from that face's plane in double
-precision, so they are as exact as the mesh.
-"""
+"""Renders a mesh as a camera sees it: rays of pixels cast at it, depth and normals, and the points that are seen."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import importlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.rays import PixelRays, pixel_rays
-from service.core.geometry import Transform
+from service.core.errors import ComputeError, ConfigurationError, DataError
+from service.core.geometry import Array, Transform, apply, inverse
+
+_DEGREES = (8, 16, 32, 64)
+_LARGEST_ERROR_PX = 1e-4
+_CHECKED = 41  # places across the image, and down it, where the polynomials are compared with the camera
+
+
+@dataclass(frozen=True, slots=True)
+class PixelRays:
+    """Normalised coordinates x/z, y/z of every pixel centre: rows[v] @ columns, both as polynomials.
+
+    Attributes:
+        width, height: of the image in pixels.
+        rows: (height, K) basis of the row.
+        columns: (K, width, 2) basis of the column, for x and y.
+    """
+
+    width: int
+    height: int
+    rows: Array
+    columns: Array
+
+    def xy(self, begin: int, end: int) -> Array:
+        """(end - begin, width, 2) undistorted x/z, y/z of the pixel centres of rows [begin, end)."""
+        flat = self.columns.reshape(len(self.columns), -1)
+        return (self.rows[begin:end] @ flat).reshape(end - begin, self.width, 2)
+
+    def turned(self, rotation: Array) -> NDArray[np.float32]:
+        """(K, width, 3) columns of the directions rotation (3, 3) @ (x, y, 1): multiply by `rows` as float32."""
+        turned = self.columns @ rotation[:, :2].T
+        turned[0] += rotation[:, 2]  # the first basis function of the rows is 1
+        return turned.astype(np.float32)
+
+
+def pixel_rays(camera: CameraModel) -> PixelRays:
+    """The rays of a camera, distorted or not; pixel centres lie at integer coordinates.
+
+    The inverse of the distortion has no closed form. It is interpolated at Chebyshev nodes of the whole image, which
+    converges geometrically for a smooth function (Trefethen, "Approximation Theory and Approximation Practice",
+    2013, chapter 8), and projected again to check it: the largest error is 1e-4 px.
+
+    Raises:
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
+    """
+    if not camera.distortion.any():
+        return _pinhole(camera)
+    for degree in _DEGREES:
+        rays = _interpolated(camera, degree)
+        if _error_px(rays, camera) <= _LARGEST_ERROR_PX:
+            return rays
+    raise ComputeError(
+        "the camera's distortion cannot be inverted for every pixel of its image",
+        where=f"k1 {camera.k1:.4g}, k2 {camera.k2:.4g}, k3 {camera.k3:.4g}",
+        remedy="Calibrate with board corners in all corners of the image, or with fewer distortion terms",
+    )
+
+
+def _pinhole(camera: CameraModel) -> PixelRays:
+    rows = np.ones((camera.height, 2))
+    rows[:, 1] = (np.arange(camera.height) - camera.cy) / camera.fy
+    columns = np.zeros((2, camera.width, 2))
+    columns[0, :, 0] = (np.arange(camera.width) - camera.cx) / camera.fx
+    columns[1, :, 1] = 1.0
+    return PixelRays(camera.width, camera.height, rows, columns)
+
+
+def _interpolated(camera: CameraModel, degree: int) -> PixelRays:
+    nodes = np.asarray(chebyshev.chebpts1(degree + 1), dtype=np.float64)
+    u, v = (0.5 * (nodes + 1) * (size - 1) for size in (camera.width, camera.height))
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    values = camera.normalise(grid).reshape(degree + 1, degree + 1, 2)
+    # Values at the nodes to coefficients: the discrete orthogonality of the Chebyshev polynomials.
+    to_coefficients = np.asarray(chebyshev.chebvander(nodes, degree), dtype=np.float64).T * (2.0 / (degree + 1))
+    to_coefficients[0] /= 2.0
+    coefficients = np.einsum("iv,jw,vwc->ijc", to_coefficients, to_coefficients, values)
+    columns = np.einsum("uj,ijc->iuc", _basis(camera.width, degree), coefficients)
+    return PixelRays(camera.width, camera.height, _basis(camera.height, degree), np.ascontiguousarray(columns))
+
+
+def _basis(size: int, degree: int) -> Array:
+    """(size, degree + 1) Chebyshev polynomials at the pixel centres."""
+    return np.asarray(chebyshev.chebvander(np.linspace(-1.0, 1.0, size), degree), dtype=np.float64)
+
+
+def _error_px(rays: PixelRays, camera: CameraModel) -> float:
+    """Largest distance between a pixel and the projection of its ray, over a grid that reaches the image's edges."""
+    u, v = (np.unique(np.linspace(0, size - 1, _CHECKED).astype(int)) for size in (rays.width, rays.height))
+    xy = np.einsum("vk,kuc->vuc", rays.rows[v], rays.columns[:, u])
+    points = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2).reshape(-1, 3)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    return float(np.abs(camera.project(points) - pixels).max())
+
+
+_CHUNK = 500_000  # faces whose corners are in memory at a time
+
+
+class RayMesh:
+    """A triangle mesh in the world frame, with a tree for rays that is built once, at the first ray of all images."""
+
+    def __init__(self, vertices_m: Array, faces: NDArray[np.integer]) -> None:
+        """Take vertices (V, 3) in metres and faces (F, 3); faces without area are left out.
+
+        Raises:
+            DataError: no face has an area, or a vertex is not finite.
+        """
+        if not np.isfinite(vertices_m).all():
+            raise DataError("the mesh has vertices that are not finite", remedy="Export the mesh again")
+        self._centre_m = 0.5 * (vertices_m.min(axis=0) + vertices_m.max(axis=0)) if len(vertices_m) else np.zeros(3)
+        normal, offset = _planes(vertices_m, faces)
+        kept = np.isfinite(normal[:, 0])
+        if not kept.any():
+            raise DataError("the mesh has no face with an area", remedy="Use a mesh, not a point cloud")
+        self._normal, self._offset_m = normal[kept], offset[kept]
+        # Single precision is enough near the mesh's centre, wherever the world's origin lies.
+        self._near = np.ascontiguousarray(vertices_m - self._centre_m, dtype=np.float32)
+        self._faces = np.ascontiguousarray(faces[kept], dtype=np.int32)
+
+    @cached_property
+    def _scene(self) -> Any:
+        """The tree; many exports need none. Raises ConfigurationError without embreex."""
+        return _tree(self._near, self._faces)
+
+    def first_face(self, eye_m: Array, directions: NDArray[np.float32]) -> NDArray[np.int32]:
+        """The index (N,) of the first face that each ray from the eye (3,) along (N, 3) hits; -1 for none.
+
+        Raises:
+            ConfigurationError: embreex, which casts the rays, is not installed.
+        """
+        origin = (eye_m - self._centre_m).astype(np.float32)
+        return np.asarray(self._scene.run(np.broadcast_to(origin, directions.shape), directions), dtype=np.int32)
+
+    def depths(self, T_world_camera: Transform, rays: Array) -> Array:
+        """Depth (N,) along z at which rays (N, 3) of a camera, with z = 1, meet the surface; NaN where they do not.
+
+        Raises:
+            ConfigurationError: embreex, which casts the rays, is not installed.
+        """
+        eye, directions = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
+        face = self.first_face(eye, np.ascontiguousarray(directions, dtype=np.float32))
+        normal = self._normal[face]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (self._offset_m[face] - normal @ eye) / np.einsum("ij,ij->i", normal, directions)
+        return np.where((face >= 0) & np.isfinite(depth) & (depth > 0), depth, np.nan)
+
+    def planes_seen(self, T_world_camera: Transform) -> Array:
+        """(F + 1, 4) each face's unit normal towards the camera, in its frame, and n · p (≤ 0) for its points p.
+
+        The last row, which the index -1 names, is zero.
+        """
+        R, eye = T_world_camera[:3, :3], T_world_camera[:3, 3]
+        planes = np.zeros((len(self._normal) + 1, 4))
+        np.matmul(self._normal, R, out=planes[:-1, :3])
+        np.subtract(self._offset_m, self._normal @ eye, out=planes[:-1, 3])
+        planes[planes[:, 3] > 0] *= -1
+        return planes
+
+
+def _planes(vertices_m: Array, faces: NDArray[np.integer]) -> tuple[Array, Array]:
+    """Unit normals (F, 3) and offsets n · p (F,); NaN for faces without area."""
+    normal, offset = np.empty((len(faces), 3)), np.empty(len(faces))
+    for begin in range(0, len(faces), _CHUNK):
+        chosen = slice(begin, begin + _CHUNK)
+        a, b, c = (vertices_m[faces[chosen, k]] for k in range(3))
+        cross = np.cross(b - a, c - a)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normal[chosen] = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+        offset[chosen] = np.sum(normal[chosen] * a, axis=1)
+    return normal, offset
+
+
+def _tree(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Any:
+    try:
+        rtcore, meshes = (
+            importlib.import_module(f"embreex.{name}") for name in ("rtcore_scene", "mesh_construction")
+        )
+    except ImportError as error:
+        raise ConfigurationError(
+            "embreex, which casts rays at a mesh, is not installed",
+            remedy="Compute depth on a machine with an x86-64 processor",
+        ) from error
+    scene = rtcore.EmbreeScene()
+    meshes.TriangleMesh(scene, vertices, faces)
+    scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first ray builds the tree
+    return scene
+
 
 Float32s = NDArray[np.float32]
 
@@ -111,3 +294,49 @@ def depth_map(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) 
     for rows in seen_rows(surface, camera, T_world_camera):
         depth[rows.first : rows.first + len(rows.depth_m)] = rows.depth_m
     return depth
+
+
+_TOLERANCE_M = 1e-3  # a point so far behind the depth of its pixel is still on the surface that is seen
+
+
+def seen_points(
+    points_m: Array, camera: CameraModel, T_world_camera: Transform, depth_m: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
+
+    Args:
+        points_m: on the surface that the depth is of.
+        camera: of the depth.
+        T_world_camera: (4, 4) of the view.
+        depth_m: (H, W) z of the surface; 0 where none is seen.
+    """
+    before = apply(inverse(T_world_camera), points_m)
+    with np.errstate(all="ignore"):
+        pixels = camera.project(before)
+    inside = (before[:, 2] > 0) & np.isfinite(pixels).all(axis=1)
+    inside &= ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
+    # On a steep surface the depth of the pixel's centre differs from that of the point: the deepest neighbour counts.
+    deepest = cv2.dilate(depth_m, np.ones((3, 3), np.uint8))
+    column, row = np.rint(pixels[inside]).astype(np.int64).T
+    seen = np.zeros(len(points_m), dtype=np.bool_)
+    seen[inside] = before[inside, 2] <= deepest[row, column] + _TOLERANCE_M
+    return seen
+
+
+def covered_shares(
+    counts: NDArray[np.int64], points_m: Array, triangles: NDArray[np.int64], at_least: Sequence[int]
+) -> tuple[float, ...]:
+    """Share of a mesh's area that at least so many views see, for each number in `at_least`.
+
+    Args:
+        counts: (V,) views that see each vertex.
+        points_m: (V, 3) vertices.
+        triangles: (F, 3); a third of each belongs to each of its corners.
+        at_least: numbers of views.
+    """
+    a, b, c = (points_m[triangles[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    weight = np.zeros(len(points_m))
+    np.add.at(weight, triangles.ravel(), np.repeat(area / 6, 3))
+    whole = max(float(weight.sum()), 1e-300)
+    return tuple(float(weight[counts >= least].sum()) / whole for least in at_least)

@@ -9,11 +9,38 @@ from typing import Literal
 
 import numpy as np
 
-from service.compute.arm.inverse_kinematics import postures_near
-from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts
-from service.compute.planning.detour import Freedom, detour
-from service.compute.planning.optics import DepthOfField, depths_m
-from service.core.geometry import Array, Transform, inverse, transform
+from service.compute.arm_kinematics import postures_near
+from service.compute.planning.collision import ArmBody, Freedom, Obstacles, detour, nearest_contacts
+from service.core.geometry import Array, Transform, apply, inverse, transform
+
+
+@dataclass(frozen=True, slots=True)
+class DepthOfField:
+    """Distances along the optical axis within which a point is blurred no wider than the circle of confusion."""
+
+    near_m: float
+    far_m: float  # infinite if focused at the hyperfocal distance or beyond
+
+
+def depth_of_field(
+    focal_length_m: float, aperture_f: float, focus_distance_m: float, circle_of_confusion_m: float
+) -> DepthOfField:
+    """Near and far limit for a thin lens focused at a distance from its entrance pupil.
+
+    With H = f² / (N c) + f: near = s (H − f) / (H + s − 2 f), far = s (H − f) / (H − s).
+    Source: S. F. Ray, Applied Photographic Optics, 3rd ed. 2002, chapter 22.
+    """
+    f, s = focal_length_m, focus_distance_m
+    hyperfocal = f**2 / (aperture_f * circle_of_confusion_m) + f
+    far = s * (hyperfocal - f) / (hyperfocal - s) if hyperfocal > s else float("inf")
+    return DepthOfField(s * (hyperfocal - f) / (hyperfocal + s - 2 * f), far)
+
+
+def depths_m(T_base_camera: Transform, points_base_m: Array) -> tuple[float, float]:
+    """Least and greatest depth along the optical axis of points (N, 3) in base coordinates, metres."""
+    depth = apply(inverse(T_base_camera), points_base_m)[:, 2]
+    return float(np.min(depth)), float(np.max(depth))
+
 
 Order = Literal["as_listed", "shortest"]
 #: Called with the stage, done and total (0: unknown). What it raises ends the planning.

@@ -1,4 +1,4 @@
-"""Registration: the pose of the scan in the world from sphere outlines in posed images of all stations."""
+"""Registers: finds the pose of the scan in the world from sphere outlines in posed images of all stations."""
 
 from __future__ import annotations
 
@@ -8,43 +8,37 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from service.compute.descent import halved_gauss_newton
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.least_squares.cost import Cost
-from service.compute.registration.least_squares.normal_equations import (
+from service.compute.registration.cost import Cost, RegistrationSettings
+from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import (
     Blocks,
+    Linearised,
+    Problem,
+    State,
+    assemble,
     compress,
     inverse_symmetric,
+    linearise,
     marginalise,
     outline_and_pose_shares,
     pose_errors,
     solve_symmetric,
 )
-from service.compute.registration.least_squares.problem import Linearised, Problem, State, assemble, linearise
-from service.compute.registration.least_squares.start import starting_state
-from service.compute.registration.least_squares.variance_components import (
-    PoseNoise,
-    estimate,
-    free_poses,
-    given_pose_noise,
-    no_pose_noise,
-    unknown_pose_noise,
-)
 from service.compute.registration.result import OutlineResidual, RegistrationResult, Solution
-from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, inverse
+from service.core.geometry import Array, Transform, apply, inverse, transform
 
 _ROUNDS = 8
 _REWEIGHTED = 3  # times, in the approach to the answer
 _STEPS = 25
 _CONVERGED = 1e-10  # decrement: a hundred-thousandth of a standard deviation
 _DEFAULT = RegistrationSettings()
-
-__all__ = ["OutlineResidual", "RegistrationResult", "register"]
 
 
 def register(
@@ -321,3 +315,158 @@ def _components(s: Solution) -> dict[str, Array]:
     parts = {"outlines": outline, "common": common, "poses": pose, "spheres": spheres}
     caused = {name: s.covariance @ part @ s.covariance for name, part in parts.items()}
     return {**caused, "spheres": caused["spheres"] + s.by_own_light()}
+
+
+def starting_state(problem: Problem, assignments: Sequence[Assignment], images: PosedImages) -> State:
+    """Initial bases and scale from the assignments' poses: the mean of the half of each station's images that agree.
+
+    Raises:
+        ComputeError: a station has no image with a pose, or the poses do not determine the scale.
+    """
+    poses, groups = images.poses, images.stations
+    scale = 1.0
+    if problem.with_scale:
+        scales = [a.scale for a in assignments if a.scale is not None]
+        scale = float(np.median(scales)) if scales else _scale(problem, assignments, poses, groups)
+    bases: list[Transform] = []
+    for g in problem.groups:
+        candidates: list[Transform] = []
+        for i, a in enumerate(assignments):
+            if int(groups[i]) == g and a.T_camera_scan is not None:
+                T = np.array(poses[i], dtype=np.float64)
+                T[:3, 3] *= scale
+                candidates.append(T @ a.T_camera_scan)
+        if not candidates:
+            raise ComputeError(f"no image of station {g} has a starting pose", where=f"station {g}")
+        middle = problem.centres.mean(axis=0)
+        places = np.array([apply(T, middle) for T in candidates])
+        far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        near = np.argsort(far)[: max(1, (len(far) + 1) // 2)]
+        R = Rotation.from_matrix(np.array([candidates[k][:3, :3] for k in near])).mean()
+        bases.append(transform(R, places[near].mean(axis=0) - R.apply(middle)))
+    n = problem.n_images
+    return State(
+        np.array(bases),
+        scale,
+        np.zeros_like(problem.centres),
+        np.zeros(problem.size - problem.common_column),
+        np.zeros((n, 6)),
+    )
+
+
+def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> float:
+    """Initial scale from the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
+    middle = problem.centres.mean(axis=0)
+    upper, lower = 0.0, 0.0
+    for g in problem.groups:
+        mine = {
+            i: poses[i][:3, :3] @ apply(a.T_camera_scan, middle)
+            for i, a in enumerate(assignments)
+            if int(groups[i]) == g and a.T_camera_scan is not None
+        }
+        if len(mine) < 2:
+            continue
+        seen = np.array(list(mine.values()))
+        position = poses[list(mine), :3, 3] - poses[list(mine), :3, 3].mean(axis=0)
+        upper -= float(np.sum(position * (seen - seen.mean(axis=0))))
+        lower += float(np.sum(position**2))
+    if upper <= 0.0 or lower <= 0.0:
+        raise ComputeError(
+            "the scale of the camera positions cannot be determined from the images alone",
+            remedy="Use poses of several images of the same scene, from different places",
+        )
+    return upper / lower
+
+
+_FACTOR = (0.02, 1e4)  # range for the outlines' variance
+_POSE = (1e-3, 1e3)  # range for the square roots below
+_GROWTH = 5.0  # largest growth of the square roots of the pose noise in one estimate
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """Square roots of the covariances of the pose errors, as a sum of parts with one factor each.
+
+    `parts` (K, N, 6, 6) must act on different rows (translation, rotation), or there is only one; `least` is the
+    smallest allowed factor; `free` tells whether the factors are estimated.
+    """
+
+    parts: Array
+    least: float
+    free: bool
+
+    def root(self, factors: Array) -> Array:
+        """(N, 6, 6) such that root @ root.T is the covariance."""
+        return np.einsum("k,knij->nij", factors, self.parts)
+
+
+def no_pose_noise(n_images: int) -> PoseNoise:
+    """No pose errors: poses taken as exact."""
+    return PoseNoise(np.zeros((1, n_images, 6, 6)), 1.0, free=False)
+
+
+def free_poses(n_images: int) -> PoseNoise:
+    """Poses that tell nothing: 0.1 m and 0.1 rad, hundreds of times what the outlines of four spheres leave open."""
+    return PoseNoise(np.tile(0.1 * np.eye(6), (1, n_images, 1, 1)), 1.0, free=False)
+
+
+def unknown_pose_noise(n_images: int) -> PoseNoise:
+    """Isotropic noise of position and of orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
+    parts = np.zeros((2, n_images, 6, 6))
+    parts[0, :, :3, :3] = 1e-4 * np.eye(3)
+    parts[1, :, 3:, 3:] = 1e-4 * np.eye(3)
+    return PoseNoise(parts, _POSE[0], free=True)
+
+
+def given_pose_noise(covariance: Array) -> PoseNoise:
+    """The stated covariances (N, 6, 6); the residuals can increase them, never decrease them."""
+    values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    return PoseNoise(root[None], 1.0, free=True)
+
+
+def estimate(
+    blocks: Blocks, noise: PoseNoise, prior: Array, prior_gradient: Array, start: tuple[float, Array]
+) -> tuple[float, Array]:
+    """Estimate the variance factors of the outlines and of the pose noise (K,) by restricted maximum likelihood.
+
+    Args:
+        blocks: linearised at the current solution.
+        noise: the form of the pose noise.
+        prior: (n, n) prior information on the common unknowns.
+        prior_gradient: (n,) gradient of the prior at the current solution.
+        start: current values.
+
+    Source: Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal",
+    Biometrika 58(3), 1971. A wide prior on the logarithm of the outlines' factor limits the influence of few
+    residuals.
+
+    The pose noise grows at most fivefold at a time. If residuals are far larger than stated, the minimiser's first
+    step would otherwise make the poses carry no information, from which neither it nor the solution recovers.
+    """
+    n_free = len(start[1]) if noise.free else 0
+    most = np.log(np.clip(_GROWTH * start[1][:n_free], max(noise.least, _POSE[0]) * _GROWTH, _POSE[1]))
+    lower = [np.log(_FACTOR[0]) / 2, *([np.log(noise.least)] * n_free)]
+    upper = [np.log(_FACTOR[1]) / 2, *most.tolist()]
+
+    def cost(y: Array) -> float:
+        factor = float(np.exp(2 * y[0]))
+        scales = np.exp(y[1:]) if n_free else start[1]
+        m = marginalise(blocks, noise.root(scales), factor)
+        H, g = m.H + prior, m.g + prior_gradient
+        # A common unknown on which these poses have no information, except by rounding, is left out.
+        told = np.diag(H) > 0
+        d = np.where(told, 1 / np.sqrt(np.where(told, np.diag(H), 1.0)), 0.0)
+        values, vectors = np.linalg.eigh(H * np.outer(d, d))
+        good = values > 1e-13
+        projected = vectors.T @ (d * g)
+        gain = float(np.sum(projected[good] ** 2 / values[good]))
+        log_H = float(np.sum(np.log(values[good])) - 2 * np.sum(np.log(d[told])))
+        return m.quadratic - gain + m.log_determinant + log_H + y[0] ** 2
+
+    at = np.clip(
+        np.concatenate([[0.5 * np.log(start[0])], np.log(np.maximum(start[1][:n_free], 1e-12))]), lower, upper
+    )
+    best = minimize(cost, at, method="L-BFGS-B", bounds=list(zip(lower, upper, strict=True)))
+    y = np.asarray(best.x, dtype=np.float64)
+    return float(np.exp(2 * y[0])), np.exp(y[1:]) if n_free else start[1]

@@ -1,4 +1,4 @@
-"""Disparities of a rectified pair by semi-global matching, in both directions, and the depth where they agree."""
+"""Finds the disparities of a rectified pair, by semi-global matching or near a guessed surface, and refines them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.pixels.render import RayMesh
 from service.compute.stereo.rectify import Rectified
-from service.compute.stereo.subpixel import refined
 from service.core.geometry import Array, Transform
 
 Image = NDArray[np.uint8]
@@ -23,7 +23,7 @@ _SPAN = (0.5, 99.5)  # percentiles of the coarse disparities
 _AGREE_PX = 1.0  # of both directions
 _JUMP_PX = 2.0  # between neighbours: an edge, where the block lies on two surfaces
 _SPECKLE_PX, _SPECKLE_STEP_PX = 150, 1.5
-_FEWEST = 200  # coarse pixels that agree; a pair with fewer does not show the same
+_FEWEST_COARSE_PIXELS = 200  # coarse pixels that agree; a pair with fewer does not show the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
     last = pair.disparity(_NEAR * distance_m) / _COARSE
     coarse = _agreed(_reduced(pair.left), _reduced(pair.right), first, last, 3)
     known = coarse[np.isfinite(coarse)]
-    if len(known) < _FEWEST:
+    if len(known) < _FEWEST_COARSE_PIXELS:
         return None
     low, high = (float(x) for x in np.percentile(known, _SPAN))
     margin = 1.5 + 0.08 * (high - low)
@@ -139,3 +139,124 @@ def _without_edges(disparity: Disparity) -> Disparity:
     out = disparity.copy()
     out[high - low > _JUMP_PX] = np.nan
     return out
+
+
+SPAN_PX = 16  # of disparity, to both sides of the guess
+_STEP = 2  # pixels between the rays of the guess
+_GUESS_JUMP_PX = 3.0  # between neighbouring rays: an edge of the guess, across which nothing is interpolated
+_FEWEST_PIXELS = 2000  # pixels that agree; a pair with fewer does not show the same
+
+
+def guided_depth(pair: Rectified, guess: RayMesh, distance_m: float) -> DepthMap | None:
+    """Depth of the left image of a pair, searched around a guessed surface; None if too little agrees.
+
+    One image is drawn as the other camera would see it if the guess were true, and then matched with the other.
+    """
+    left, right = pair.left_camera, pair.right_camera
+    forward = _disparity_of(guess, left, pair.T_world_left, pair)
+    backward = _disparity_of(guess, right, pair.T_world_right, pair)
+    forth = _searched(pair.left, pair.right, forward)
+    mirrored = _searched(_flipped(pair.right), _flipped(pair.left), np.ascontiguousarray(backward[:, ::-1]))
+    back = np.ascontiguousarray(mirrored[:, ::-1])
+    found = refined(pair.left, pair.right, confirmed(forth, back))
+    found[~pair.seen] = np.nan
+    if np.count_nonzero(np.isfinite(found)) < _FEWEST_PIXELS:
+        return None
+    return depth_map(pair, found, distance_m)
+
+
+def _flipped(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _disparity_of(guess: RayMesh, camera: CameraModel, T_world_camera: Transform, pair: Rectified) -> Disparity:
+    """Disparities (H, W) that the guess would have in one of the two cameras; NaN where it is not met."""
+    depth = _depth_of(guess, camera, T_world_camera)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sparse = (pair.f_px * pair.baseline_m / depth + pair.left_px - pair.right_px).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    filled = np.nan_to_num(sparse, nan=-1e6, posinf=-1e6)
+    jump = cv2.dilate(filled, kernel) - cv2.erode(filled, kernel) > _GUESS_JUMP_PX * _STEP
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32) / np.float32(_STEP)
+    smooth = cv2.remap(sparse, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    nearest = cv2.remap(sparse, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    at_edge = cv2.remap(jump.astype(np.uint8), columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
+    return np.where(at_edge, nearest, smooth).astype(np.float32)
+
+
+def _depth_of(guess: RayMesh, camera: CameraModel, T_world_camera: Transform) -> NDArray[np.float64]:
+    """Depth along z of every _STEP-th pixel; NaN where no surface is met."""
+    v, u = np.mgrid[: camera.height : _STEP, : camera.width : _STEP]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    return guess.depths(T_world_camera, rays.reshape(-1, 3)).reshape(u.shape)
+
+
+def _searched(one: NDArray[np.uint8], two: NDArray[np.uint8], guess: Disparity) -> Disparity:
+    """Disparities (H, W) of image `one` within SPAN_PX of the guess in its pixels; NaN elsewhere."""
+    height, width = one.shape
+    border = 2 * SPAN_PX
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    known = np.isfinite(guess)
+    level = cv2.remap(
+        two, np.where(known, columns - guess, -1), rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    a, b = (np.pad(image, ((0, 0), (border, border)), mode="edge") for image in (one, np.asarray(level, np.uint8)))
+    rest = matched(matcher_of(-SPAN_PX, 2 * SPAN_PX, _BLOCK), a, b, -SPAN_PX)[:, border : border + width]
+    # The partner stands at the column less the rest, and was drawn there with the guess of that column.
+    there = cv2.remap(
+        guess, np.nan_to_num(columns - rest, nan=-10.0), rows, cv2.INTER_LINEAR, borderValue=float("nan")
+    )
+    found = rest + there
+    found[~known] = np.nan
+    return np.asarray(found, dtype=np.float32)
+
+
+# Disparities to a small part of a pixel, by least squares between the images along the rows.
+#
+# Semi-global matching prefers whole pixels. Source of the method: Lucas and Kanade, "An iterative image
+# registration technique", IJCAI 1981, in one dimension; grey values may differ by an offset within the window.
+
+
+_WINDOW = 7
+_ROUNDS = 4
+_FARTHEST_PX = 1.0  # from the start: beyond it another minimum was found
+_LEAST_CONTRAST = 4.0  # grey values² of the gradient's variance: less is noise
+_FEWEST_KNOWN = 0.5  # share of the window that must be known
+
+
+def refined(left: Image, right: Image, disparity: Disparity) -> Disparity:
+    """Disparities (H, W) of the left image, refined; as they were where the images say too little.
+
+    NaN stays NaN, and becomes of what moves by more than _FARTHEST_PX.
+    """
+    known = np.isfinite(disparity)
+    weight = known.astype(np.float32)
+    share = np.maximum(_mean(weight), np.float32(1e-6))
+    one, two = (image.astype(np.float32) for image in (left, right))
+    gradient = np.asarray(cv2.Sobel(two, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), dtype=np.float32)
+    columns, rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in left.shape[::-1]))
+    found = np.where(known, disparity, np.float32(0)).astype(np.float32)
+    start = found.copy()
+    for _ in range(_ROUNDS):
+        partner = columns - found
+        there, slope = (
+            np.asarray(cv2.remap(image, partner, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
+            for image in (two, gradient)
+        )
+        rest = one - there
+        mean_rest, mean_slope = (
+            _mean(np.asarray(weight * value, dtype=np.float32)) / share for value in (rest, slope)
+        )
+        variance = _mean(weight * slope**2) / share - mean_slope**2
+        together = _mean(weight * slope * rest) / share - mean_slope * mean_rest
+        usable = known & (variance > _LEAST_CONTRAST) & (share > _FEWEST_KNOWN)
+        # right(x - d - s) ≈ there - slope * s
+        step = np.where(usable, -together / np.maximum(variance, np.float32(1e-6)), 0.0)
+        found += np.clip(step, -0.5, 0.5).astype(np.float32)
+    found[~known | (np.abs(found - start) > _FARTHEST_PX)] = np.nan
+    return found
+
+
+def _mean(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    """The mean over the window around each pixel."""
+    return np.asarray(cv2.boxFilter(image, cv2.CV_32F, (_WINDOW, _WINDOW)), dtype=np.float32)

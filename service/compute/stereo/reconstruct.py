@@ -9,16 +9,12 @@ import cv2
 import numpy as np
 
 from service.compute.ground_truth.surface import Surface
-from service.compute.memory import return_freed_memory
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.stereo.closed import closed
-from service.compute.stereo.fusion import fused
-from service.compute.stereo.guided import guided_depth
-from service.compute.stereo.matching import DepthMap, depth_of_pair
-from service.compute.stereo.pairs import StereoView, looked_at_m, stereo_pairs
-from service.compute.stereo.rectify import rectified
-from service.compute.stereo.steep.complete import completed
-from service.compute.stereo.surface import surface_of
+from service.compute.pixels.render import RayMesh
+from service.compute.resources import return_freed_memory
+from service.compute.stereo.fusion import fused, surface_of
+from service.compute.stereo.matching import DepthMap, depth_of_pair, guided_depth
+from service.compute.stereo.rectify import StereoView, looked_at_m, rectified, stereo_pairs
+from service.compute.stereo.steep import closed, completed
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.files.pose_files import HALF_PIXEL
+from service.compute.poses.pose_files import HALF_PIXEL
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse
 from service.dataset.export_folder import ExportFolder, Part

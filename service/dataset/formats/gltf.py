@@ -7,7 +7,7 @@ import math
 import struct
 from typing import Any
 
-from service.compute.poses.files.pose_files import OPENGL
+from service.compute.poses.pose_files import OPENGL
 from service.dataset.export_folder import ExportFolder
 from service.dataset.exporter import Exporter
 from service.dataset.records import DataSet, PosedView

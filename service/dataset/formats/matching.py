@@ -13,11 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.distances.sampling import random_points
+from service.compute.ground_truth.chamfer import random_points
 from service.compute.ground_truth.surface import Surface
-from service.compute.matching.pairs.covisibility import LEAST_OVERLAP, Covisibility, covisibility, points_seen
-from service.compute.matching.pairs.listed import ListedPair, listed_pairs
-from service.compute.matching.pairs.loader import View as GroundTruth
+from service.compute.matching.loader import View as GroundTruth
+from service.compute.matching.pairs import (
+    LEAST_OVERLAP,
+    Covisibility,
+    ListedPair,
+    covisibility,
+    listed_pairs,
+    points_seen,
+)
 from service.core.units import mm, mrad
 from service.dataset.export_folder import ExportFolder, Part
 from service.dataset.exporter import Exporter
@@ -56,7 +62,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.file("pairs.json", lambda: _json(_pairs(dataset, truth.pairs)))
     folder.file("pairs.csv", lambda: _table(dataset, truth.pairs))
     folder.file("covisibility.json", lambda: _json(_graph(dataset, truth.covisible)))
-    loader = importlib.resources.files("service.compute.matching.pairs").joinpath("loader.py")
+    loader = importlib.resources.files("service.compute.matching").joinpath("loader.py")
     folder.file("loader.py", loader.read_bytes)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from service.compute.poses.ros.messages import (
+from service.compute.poses.ros_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     DEFINITIONS,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.ply import ply_bytes
+from service.compute.ground_truth.surface import ply_bytes
 from service.compute.pixels.metadata import described
 from service.core.errors import DataError
 from service.core.geometry import Array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, NoAnswer
 from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Point, PosedPhotograph
 

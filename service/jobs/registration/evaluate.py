@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import PosedPhotograph, SpheresFound
 from service.jobs.registration.register import Registration

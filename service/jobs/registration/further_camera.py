@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, ImageFile, Matrix, ParameterCovariance, Point
 

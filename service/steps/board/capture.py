@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import CalibrationTargets, ChosenViews, PlanPrediction
-from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
+from service.compute.board.board import Board
+from service.compute.board.design import CalibrationTargets, ChosenViews, PlanPrediction
+from service.compute.board.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import Order, best_posture
 from service.core.errors import ComputeError

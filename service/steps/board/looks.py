@@ -7,7 +7,7 @@ from typing import TypedDict
 
 import numpy as np
 
-from service.compute.calibration.board.board import Board, BoardView
+from service.compute.board.board import Board, BoardView
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import JobState
 from service.jobs.calibration import board_view

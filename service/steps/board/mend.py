@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from service.compute.calibration.board_poses.design import PlanPrediction
+from service.compute.board.design import PlanPrediction
 from service.core.gates.verdict import describe, evaluate_gates
 from service.core.records.events import GateVerdict
 from service.core.text.counts import counted

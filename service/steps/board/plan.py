@@ -8,18 +8,18 @@ from typing import Literal
 
 import numpy as np
 
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.candidates import board_candidates
-from service.compute.calibration.board_poses.design import (
+from service.compute.board.board import Board
+from service.compute.board.design import (
     NOTHING,
     CalibrationTargets,
     ChosenViews,
     DesignProblem,
     PlanPrediction,
+    board_candidates,
     choose_poses,
 )
-from service.compute.calibration.board_poses.knowledge import BoardKnowledge, Tolerances, nominal_knowledge
-from service.compute.calibration.board_poses.view_range import ViewRange
+from service.compute.board.knowledge import BoardKnowledge, Tolerances, nominal_knowledge
+from service.compute.board.view_range import ViewRange
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import metres

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.compute.calibration.board_poses.view_range import ViewRange
+from service.compute.board.view_range import ViewRange
 from service.core.records.events import Record
 
 

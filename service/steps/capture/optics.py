@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from service.compute.calibration.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
+from service.compute.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
 from service.core.records.events import RecordedView
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING

@@ -12,8 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from service.compute.poses.sfm.options import SfmOptions
-from service.compute.poses.sfm.pairs import pairs_of
+from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
 from service.core.jobs.keys import job_key

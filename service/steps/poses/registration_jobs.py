@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.poses.sfm.options import SfmOptions
-from service.compute.poses.sfm.pairs import pairs_of
+from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.jobs.keys import arguments_name, newest_job
 from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.jobs.references import Reference, jobs_of, resolve

@@ -2,7 +2,7 @@
 
 If the database is rewritten, cut or replaced, the log holds signatures that no longer fit it. Each line is signed and
 holds the hash of the line before it, so that lines cannot be removed, changed or swapped. A cut at the end is found
-with a copy kept elsewhere (service.store.signatures.log_copy).
+with a copy kept elsewhere (service.store.signatures.second_place).
 """
 
 from __future__ import annotations

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from service.compute.arm.correction import corrected_T_base_flange
-from service.compute.arm.inverse_kinematics import nearest_posture
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
-from service.compute.calibration.hand_eye.answers import HandEyeAnswer
+from service.compute.arm_correction import corrected_T_base_flange
+from service.compute.arm_kinematics import nearest_posture
+from service.compute.board.board import Board
+from service.compute.board.next_poses import SuggestedPose, suggest_board_poses
 from service.compute.camera_model import CameraModel
+from service.compute.hand_eye.estimate import HandEyeAnswer
 from service.core.arms.known import known_arm
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, Transform, inverse

@@ -12,10 +12,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.archive import outline_from_record
-from service.compute.markers.records import SphereOutline
-from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.identification.pairing import CONTROL_GATE, paired
+from service.compute.markers.records import SphereOutline, outline_from_record
+from service.compute.poses.camera_files import read_camera_json
+from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs.references import jobs_of
 from service.core.protocol.step_params import Gives
@@ -101,7 +100,7 @@ def _numbered(found: SpheresFound, kind: SphereKind) -> tuple[Sphere, ...]:
     )
 
 
-OutlineRecord = dict[str, object]  # as service.compute.markers.archive writes it
+OutlineRecord = dict[str, object]  # as service.compute.markers.records writes it
 _OUTLINES_BY_VIEWPOINT = TypeAdapter(dict[str, tuple[OutlineRecord, ...]])
 
 

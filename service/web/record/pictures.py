@@ -89,7 +89,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, 
     """
     import cv2  # noqa: PLC0415 - a web process starts without it
 
-    from service.compute.images.shown import decode_reduced  # noqa: PLC0415 - the same
+    from service.compute.images.photographs import decode_reduced  # noqa: PLC0415 - the same
 
     content = path.read_bytes()
     with _DECODING:

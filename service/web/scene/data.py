@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.evaluation.closure import Alignment
+from service.compute.evaluation.error_budget import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
 from service.core.text.counts import counted

@@ -7,12 +7,10 @@ import os
 import cv2
 import numpy as np
 
-from service.compute.calibration.board.board import Board, BoardView, find_board
-from service.compute.calibration.board.images import BoardImage, find_boards
-from service.compute.calibration.board.parts import with_parts
-from service.compute.calibration.board_poses.knowledge import BoardKnowledge
-from service.compute.images.files import read_grey
-from service.compute.images.quality import image_quality
+from service.compute.board.board import Board, BoardView, find_board
+from service.compute.board.knowledge import BoardKnowledge
+from service.compute.board.search import BoardImage, find_boards, with_parts
+from service.compute.images.photographs import image_quality, read_grey
 from service.core.errors import ComputeError
 from service.jobs.calibration import board_view as job
 from service.jobs.calibration import calibrate as calibrate_job

@@ -7,20 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.compute.arm.kinematics import matching_arm
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board.images import UsableViews, usable_views
-from service.compute.calibration.hand_eye.answers import HandEyeResult
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.reprojection import board_corners
-from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
-from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
-from service.compute.calibration.intrinsics.validation import (
+from service.compute.arm_kinematics import matching_arm
+from service.compute.board.board import Board
+from service.compute.board.search import UsableViews, usable_views
+from service.compute.camera_model import CameraModel
+from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.hand_eye.reprojection import board_corners
+from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.intrinsics.uncertainty import (
     MIN_VIEWS_TO_VALIDATE,
+    board_distance_m,
     calibration_warnings,
     cross_validate,
+    projection_uncertainty,
 )
-from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.units import metres
 from service.jobs.calibration import calibrate as job

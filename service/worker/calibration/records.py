@@ -7,15 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.compute.arm.correction import ArmCorrection, CorrectedMounting
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeAnswer, HandEyeResult
-from service.compute.calibration.hand_eye.board_size import BoardSizeFound
-from service.compute.calibration.hand_eye.closed_form import distance
-from service.compute.calibration.hand_eye.setup import Setup
-from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, IntrinsicsResult
-from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
-from service.compute.calibration.intrinsics.validation import CrossValidation, residual_field
+from service.compute.arm_correction import ArmCorrection, CorrectedMounting
+from service.compute.board.board import Board
+from service.compute.hand_eye.estimate import CorrectedHandEye, HandEyeAnswer, HandEyeResult
+from service.compute.hand_eye.setup import Setup, distance
+from service.compute.hand_eye.uncertainty import BoardSizeFound
+from service.compute.intrinsics.estimate import COVERAGE_GRID, IntrinsicsResult
+from service.compute.intrinsics.uncertainty import CrossValidation, ProjectionUncertainty, residual_field
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.units import deg, metres, mm

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from service.compute.capture.live import expected_spheres, image_measures
-from service.compute.images.files import read_image_of
-from service.compute.markers.archive import outline_record
+from service.compute.images.photographs import read_image_of
+from service.compute.live import expected_spheres, image_measures
 from service.compute.markers.detect import detect_spheres
-from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.further_cameras.pose import sighted_pose
+from service.compute.markers.records import outline_record
+from service.compute.poses.camera_files import read_camera_json
+from service.compute.registration.further_camera import sighted_pose
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import inverse

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.capture.hand_bundle import ImageReading
+from service.compute.hand_held import ImageReading
 from service.compute.planning.hand_guidance import WantedView, level_frame, same_view
 from service.core.geometry import Array, Transform, inverse
 from service.jobs.capture import hand_view as job

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from service.compute.calibration.board.board import Board, find_board
-from service.compute.calibration.intrinsics.estimate import coverage_map_of, locate_view
-from service.compute.images.files import read_grey
+from service.compute.board.board import Board, find_board
+from service.compute.images.photographs import read_grey
+from service.compute.intrinsics.estimate import coverage_map_of, locate_view
 from service.core.errors import ComputeError
 from service.core.geometry import inverse
 from service.jobs.capture import hand_board as job

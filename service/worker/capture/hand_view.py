@@ -8,10 +8,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from service.compute.capture.hand_bundle import ImageReading, adjust_together
-from service.compute.capture.hand_view import HandView, look_at_image
-from service.compute.images.files import read_image
-from service.compute.markers.detectors import options_for
+from service.compute.hand_held import HandView, ImageReading, adjust_together, look_at_image
+from service.compute.images.photographs import read_image
+from service.compute.markers.detect import options_for
 from service.compute.planning.hand_guidance import away_from_plane
 from service.core.geometry import Array, Transform
 from service.core.units import mm

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.capture.hand_bundle import ImageReading
+from service.compute.hand_held import ImageReading
 from service.core.geometry import Array, Transform
 from service.jobs.capture.hand_view import HeldArguments
 from service.worker.capture.scene import CaptureScene

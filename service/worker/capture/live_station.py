@@ -10,9 +10,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.capture.live import LiveView, ProvisionalRegistration, register_station
-from service.compute.markers.archive import outline_from_record, outline_record
-from service.compute.planning.information import (
+from service.compute.live import LiveView, ProvisionalRegistration, register_station
+from service.compute.markers.records import outline_from_record, outline_record
+from service.compute.planning.next_views import (
     ViewInformation,
     mounting_covariance,
     point_sigmas_m,
@@ -20,7 +20,7 @@ from service.compute.planning.information import (
     pose_scatter,
     view_information,
 )
-from service.compute.registration.identification.pairing import paired
+from service.compute.registration.hypotheses import paired
 from service.compute.scene import ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse
 from service.jobs.capture.live_view import LiveArguments

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.compute.capture.live import expected_spheres
+from service.compute.live import expected_spheres
 from service.compute.planning.coverage import covered_fraction
-from service.compute.planning.information import predicted_information
-from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
+from service.compute.planning.next_views import CurrentInformation, ViewGain, next_best_views, predicted_information
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse
 from service.core.units import mm

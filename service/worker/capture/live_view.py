@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from service.compute.capture.live import LiveView, expected_spheres, image_measures
-from service.compute.images.files import read_image
-from service.compute.markers.search.predicted import NEAR, PredictedSpheres, find_outlines, tone_of
+from service.compute.images.photographs import read_image
+from service.compute.live import LiveView, expected_spheres, image_measures
+from service.compute.markers.predicted import NEAR, PredictedSpheres, find_outlines, tone_of
 from service.compute.planning.coverage import covered_fraction
 from service.core.errors import ComputeError
 from service.core.geometry import Transform, inverse

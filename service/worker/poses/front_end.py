@@ -8,11 +8,10 @@ from typing import Any
 
 import cv2
 
-from service.compute.poses.colmap.process import ColmapProcess
-from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
-from service.compute.poses.sfm.front_end import FrontEnd
-from service.compute.poses.sfm.options import SfmOptions
-from service.compute.poses.sfm.pairs import pairs_of
+from service.compute.sfm.colmap_process import ColmapProcess
+from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.sfm.front_end import FrontEnd
+from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.geometry import Transform
 from service.jobs.poses import features as features_job
 from service.jobs.poses import match as match_job

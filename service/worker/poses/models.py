@@ -9,12 +9,11 @@ from functools import partial
 
 import numpy as np
 
-from service.compute.poses.files.pose_covariance import blocks
-from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, reconstruct_from
-from service.compute.poses.sfm.options import Mapper, SfmOptions
-from service.compute.poses.sfm.tracks import Tracks
+from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.scene import PosedImages, ScanSpheres
+from service.compute.sfm.estimate import SfmModel, SfmWorkspace, blocks, reconstruct, reconstruct_from
+from service.compute.sfm.features import Tracks
+from service.compute.sfm.options import Mapper, SfmOptions
 from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job

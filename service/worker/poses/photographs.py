@@ -12,9 +12,9 @@ from typing import TypeVar
 import cv2
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image
-from service.compute.images.resolution import resample
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.images.photographs import read_image
+from service.compute.pixels.resample import resample
+from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import JobRecord
 from service.jobs.records import ImageFile, ImagesCamera
 from service.worker.camera import camera_reduced, camera_used

@@ -8,7 +8,7 @@ import cv2
 
 from service.compute.images.develop import develop, encode_tiff
 from service.compute.images.develop_parameters import DevelopParameters
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.jobs.registration import develop as job
 from service.worker.job import JobAnswer, JobContext
 

@@ -11,29 +11,30 @@ import cv2
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.contradictions.common_errors import UNEXPLAINED
-from service.compute.evaluation.closure import Alignment, compare_shapes, locate_in_images
 from service.compute.evaluation.control_spheres import ControlEvaluation, ExpectedNearby, evaluate_controls
 from service.compute.evaluation.error_budget import (
     CONTROL_SPHERES,
+    Alignment,
     ErrorBudget,
     MeasuredSpheres,
     Observation,
+    compare_shapes,
     contributions,
     control_observation,
+    locate_in_images,
     loop_observations,
 )
-from service.compute.images.files import read_image
-from service.compute.images.resolution import resample
-from service.compute.machine_memory import IMAGE_MB, processes_for
+from service.compute.images.photographs import read_image
 from service.compute.markers.cones import Cone
-from service.compute.markers.detectors import options_for
+from service.compute.markers.detect import options_for
+from service.compute.markers.image_files import search_nearby
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import search_nearby
-from service.compute.overlay import draw_overlay
-from service.compute.pipeline import INTRINSICS, Detection
-from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.identification.pairing import CONTROL_GATE, paired
+from service.compute.pipeline import INTRINSICS, Detection, draw_overlay
+from service.compute.pixels.resample import resample
+from service.compute.registration.common_errors import UNEXPLAINED
+from service.compute.registration.hypotheses import CONTROL_GATE, paired
+from service.compute.registration.identity import Assignment
+from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
-from service.compute.camera_model import CameraModel
-from service.compute.machine_memory import IMAGE_MB, processes_for
-from service.compute.markers.archive import outline_from_record, outline_record
-from service.compute.markers.detectors import options_for
-from service.compute.markers.developed import remeasure_file
-from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import detect_all
-from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.further_cameras.pose import (
+from service.compute.camera_model import CameraCovariance, CameraModel, read_camera_covariance
+from service.compute.markers.detect import options_for
+from service.compute.markers.image_files import detect_all
+from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
+from service.compute.markers.refine import remeasure_file
+from service.compute.poses.camera_files import read_camera_json
+from service.compute.registration.further_camera import (
     FurtherPose,
     OuterFrame,
     SightedPose,
@@ -25,7 +22,8 @@ from service.compute.registration.further_cameras.pose import (
     rigid_pose,
     sighted_pose,
 )
-from service.compute.registration.further_cameras.pose_covariances import of_inverse, of_product
+from service.compute.registration.pose_errors import of_inverse, of_product
+from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse

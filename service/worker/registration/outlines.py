@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.machine_memory import IMAGE_MB, processes_for
-from service.compute.markers.archive import outline_from_record, outline_record
-from service.compute.markers.detectors import options_for
-from service.compute.markers.developed import remeasure_file
-from service.compute.markers.grounded.detector import GroundedDetector
-from service.compute.markers.grounded.weights import Weights, weights_in
-from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines, searched_whole
-from service.compute.markers.search.paper_files import detect_file_by_masks
+from service.compute.markers.detect import options_for
+from service.compute.markers.grounded import GroundedDetector
+from service.compute.markers.grounded_networks import Weights, weights_in
+from service.compute.markers.image_files import LocatedOutlines, detect_all, locate_outlines, searched_whole
+from service.compute.markers.paper import detect_file_by_masks
+from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
+from service.compute.markers.refine import remeasure_file
+from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.jobs.poses.structure_from_motion import ModelFile

@@ -11,17 +11,16 @@ from functools import partial
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.capture.located import poses_by_spheres
-from service.compute.contradictions.common_errors import UNEXPLAINED, held_lens_covariance
 from service.compute.evaluation.accuracy import leave_one_out
-from service.compute.evaluation.closure import Alignment
+from service.compute.evaluation.error_budget import Alignment
+from service.compute.hand_held import poses_by_spheres
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, PipelineResult, register_images
-from service.compute.registration.camera_errors import camera_errors
-from service.compute.registration.identification.identity import identify
-from service.compute.registration.joint_poses import with_joint_pose_covariance
+from service.compute.registration.common_errors import UNEXPLAINED, held_lens_covariance
+from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.identity import identify
+from service.compute.registration.pose_errors import camera_errors, with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
-from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse

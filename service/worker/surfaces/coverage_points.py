@@ -6,8 +6,8 @@ import io
 
 import numpy as np
 
-from service.compute.memory import large_arrays_returned
 from service.compute.planning.coverage import coverage_surface
+from service.compute.resources import large_arrays_returned
 from service.jobs.surfaces import coverage_points as job
 from service.worker.capture.scene import limits_of
 from service.worker.job import JobAnswer, JobContext

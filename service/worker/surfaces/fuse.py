@@ -6,20 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.ground_truth.align import Aligned, MeshSpheres, align_spheres
-from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
-from service.compute.ground_truth.distances.heat_map import HeatScale
-from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
-from service.compute.ground_truth.frames import TransformLoop, close_transforms
-from service.compute.ground_truth.fusion.common import common_part
-from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
-from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source
-from service.compute.ground_truth.fusion.fuse import fuse as fuse_surfaces
-from service.compute.ground_truth.fusion.picture import fusion_picture
-from service.compute.ground_truth.fusion.regions import Box, Prism, RegionCorrection, outline, seen_along
-from service.compute.ground_truth.ply import write_ply
-from service.compute.ground_truth.surface import Surface
-from service.compute.memory import large_arrays_returned
+from service.compute.ground_truth.align import (
+    Aligned,
+    MeshSpheres,
+    TransformLoop,
+    align_spheres,
+    close_transforms,
+    common_part,
+)
+from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
+from service.compute.ground_truth.fuse import Fused, FusionSettings, Markers, Source, without_markers
+from service.compute.ground_truth.fuse import fuse as fuse_surfaces
+from service.compute.ground_truth.heat_map import HeatScale, fusion_picture, write_heat_mesh
+from service.compute.ground_truth.overlap import Box, Prism, RegionCorrection, outline, seen_along
+from service.compute.ground_truth.surface import Surface, write_ply
+from service.compute.resources import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import ArtefactRef

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image
+from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import (
     REQUIRED_MARGIN_M,
     LayoutReport,
@@ -17,10 +17,9 @@ from service.compute.layout.ambiguity import (
     layout_bounds,
     layout_measures,
 )
+from service.compute.layout.moves import PhotographedMove, innermost, show_move, suggest_moves
 from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
 from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
-from service.compute.layout.sphere_moves import innermost, suggest_moves
-from service.compute.layout.words import PhotographedMove, show_move
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
 from service.core.errors import ComputeError, DataError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.compute.memory import large_arrays_returned
-from service.compute.surfaces.part_merging import merge_parts
+from service.compute.resources import large_arrays_returned
+from service.compute.surfaces.constellations import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import apply
 from service.core.units import mm

@@ -8,15 +8,17 @@ import numpy as np
 
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
-from service.compute.memory import large_arrays_returned
-from service.compute.surfaces.constellations import match_constellations
-from service.compute.surfaces.cut_ends import cut_voxels
-from service.compute.surfaces.isosurface import surface
-from service.compute.surfaces.label_surface import LEAST_CONTRAST_HU, label_surface, sphere_contrasts
-from service.compute.surfaces.loop_closure import LoopClosure, close_loop
-from service.compute.surfaces.spheres.mesh_spheres import MeshSphere
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres as find_spheres
-from service.compute.surfaces.spheres.wrong_unit import wrong_unit
+from service.compute.resources import large_arrays_returned
+from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
+from service.compute.surfaces.isosurface import (
+    LEAST_CONTRAST_HU,
+    cut_voxels,
+    label_surface,
+    sphere_contrasts,
+    surface,
+)
+from service.compute.surfaces.mesh_spheres import MeshSphere, wrong_unit
+from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm

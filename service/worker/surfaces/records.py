@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.compute.layout.ambiguity import BoundedLength, LayoutReport, layout_bounds
-from service.compute.surfaces.spheres.mesh_spheres import MeshSphere
+from service.compute.surfaces.mesh_spheres import MeshSphere
 from service.core.records.events import Uncertainty
 from service.core.units import deg, mm
 from service.jobs.records import JudgedLayout, MeasuredSphere, SphereConfusion, matrix

@@ -12,11 +12,11 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from service.compute.arm.inverse_kinematics import nearest_posture
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import CalibrationTargets
-from service.compute.calibration.hand_eye.reprojection import BoardCorners
+from service.compute.arm_kinematics import nearest_posture
+from service.compute.board.board import Board
+from service.compute.board.design import CalibrationTargets
 from service.compute.camera_model import CameraModel
+from service.compute.hand_eye.reprojection import BoardCorners
 from service.core.arms.known import arm_model
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection

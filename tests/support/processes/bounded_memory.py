@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.ground_truth import chamfer, distances, fuse, overlap
 from service.compute.ground_truth import surface as surfaces
-from service.compute.ground_truth.distances import chamfer, sampling, triangle_tree
-from service.compute.ground_truth.fusion import deviation, fuse, overlap
 from service.compute.ground_truth.surface import Surface
 from service.compute.planning import coverage
 from service.compute.surfaces import isosurface
@@ -63,7 +62,7 @@ def _everything(surface: coverage.CoverageSurface, *_: object) -> NDArray[np.boo
 
 def nearest(n: int) -> None:
     """The distances of a few points to 180,000 faces."""
-    triangle_tree.TriangleTree(wavy(n, 0.1)).nearest(np.zeros((10, 3)), np.full(10, 0.01))
+    distances.TriangleTree(wavy(n, 0.1)).nearest(np.zeros((10, 3)), np.full(10, 0.01))
 
 
 def extracted(n: int) -> None:
@@ -86,8 +85,8 @@ def main() -> None:
     """Compute it once small, then in full under the limit; writes how many megabytes that took."""
     compute, limit_mb = COMPUTATIONS[sys.argv[1]], float(sys.argv[2])
     for module, name in (
-        (surfaces, "FACES"), (sampling, "_BLOCK"), (chamfer, "MOST_COMPARED"), (fuse, "_VERTICES"),
-        (overlap, "_POINTS"), (overlap, "_FACES"), (deviation, "_FACES"), (triangle_tree, "_LEAVES"),
+        (surfaces, "FACES"), (chamfer, "_BLOCK"), (chamfer, "MOST_COMPARED"), (fuse, "_VERTICES"),
+        (overlap, "_POINTS"), (overlap, "_FACES"), (fuse, "_FACES"), (distances, "_LEAVES"),
         (isosurface, "_FACES"),
     ):  # fmt: skip
         if hasattr(module, name):

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import trimesh
 
-from service.compute.poses.files.camera_files import write_camera_json
-from service.compute.poses.files.pose_files import write_poses_csv
+from service.compute.poses.camera_files import write_camera_json
+from service.compute.poses.pose_files import write_poses_csv
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store

@@ -10,11 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.compute.calibration.board.board import BoardView
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
-from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
-from service.compute.calibration.intrinsics.validation import calibration_warnings, cross_validate
+from service.compute.board.board import BoardView
+from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.intrinsics.estimate import calibrate_intrinsics
+from service.compute.intrinsics.uncertainty import (
+    board_distance_m,
+    calibration_warnings,
+    cross_validate,
+    projection_uncertainty,
+)
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import (

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import CameraSettings
-from service.compute.capture.hand_view import HandView
-from service.compute.planning.information import ViewInformation
+from service.compute.hand_held import HandView
+from service.compute.planning.next_views import ViewInformation
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from simulators.hand.technician import Grip, follow

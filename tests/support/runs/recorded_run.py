@@ -148,7 +148,7 @@ class _Recorder:
         self._begin(step, 1)
         made = scene(6, width=1200, seed=5)
         # Imported here, because records of outlines need the worker's numerics.
-        from service.compute.markers.archive import outline_record  # noqa: PLC0415
+        from service.compute.markers.records import outline_record  # noqa: PLC0415
 
         outlines = [exact_outlines(made, i, REGISTRATION_M, noise_px=0.05, seed=5)[0] for i in range(6)]
         found = {f"v{i}": [outline_record(o) for o in mine] for i, mine in enumerate(outlines)}

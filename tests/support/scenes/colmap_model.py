@@ -8,7 +8,7 @@ from pathlib import Path
 import pycolmap
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.colmap.convention import to_colmap_camera, to_colmap_pose
+from service.compute.sfm.colmap import to_colmap_camera, to_colmap_pose
 from service.core.geometry import Transform
 
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import WorldSphere, posts_below
-from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.rays import pixel_rays
-from service.compute.pixels.splits import splits
+from service.compute.pixels.render import RayMesh, pixel_rays
+from service.compute.pixels.views import splits
 from service.core.geometry import Array, Transform, apply, inverse, look_at
 from service.dataset.pixels import Photographs
 from service.dataset.records import DataSet, Mesh, PosedView

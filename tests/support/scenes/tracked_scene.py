@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.poses.sfm.tracks import Tracks
+from service.compute.sfm.features import Tracks
 from service.core.geometry import Array, apply, inverse, transform
 from tests.support.scenes.sphere_images import REGISTRATION_M, exact_outlines, scene
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from service.audit.export.process import export
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
-from service.compute.poses.files.pose_files import read_poses_csv
+from service.compute.poses.pose_files import read_poses_csv
 from service.core.errors import StoreError
 from service.core.gates.release import release_meaning
 from service.core.records.events import EvidenceExported, OperatorAction, RunReleased, ViewpointCaptured

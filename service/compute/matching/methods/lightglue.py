@@ -10,8 +10,7 @@ import numpy as np
 from service.compute.matching.methods.method import Matcher, Matches, Picture
 from service.compute.matching.methods.networks import Network, Torch, Weights, read_weights, set_weights, torch_with
 from service.compute.matching.methods.sift import ExtractedSift
-from service.compute.poses.colmap.convention import from_colmap_pixels
-from service.compute.poses.sfm.extraction import SiftFeatures
+from service.compute.sfm.colmap import SiftFeatures, from_colmap_pixels
 
 WEIGHTS = "sift_lightglue.pth (release v0.1_arxiv of LightGlue, for SIFT)"
 MOST_FEATURES = 2048  # with which its pose errors were published (Lindenberger et al., ICCV 2023)

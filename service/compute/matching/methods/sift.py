@@ -10,9 +10,8 @@ import numpy as np
 import pycolmap
 
 from service.compute.matching.methods.method import Matcher, Matches, Picture
-from service.compute.poses.colmap.convention import from_colmap_pixels
-from service.compute.poses.sfm.extraction import SiftFeatures, extract_sift
-from service.compute.poses.sfm.features import match_descriptors
+from service.compute.sfm.colmap import SiftFeatures, extract_sift, from_colmap_pixels
+from service.compute.sfm.features import match_descriptors
 
 MOST_FEATURES = 8192  # COLMAP's default
 FIRST_OCTAVE = -1  # COLMAP's default: the image is doubled first

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from service.compute.arm.inverse_kinematics import nearest_posture
+from service.compute.arm_kinematics import nearest_posture
 from service.compute.planning.collision import ArmBody, Capsule, Obstacles
 from service.compute.planning.motion_plan import (
     MotionPlan,
@@ -16,10 +16,10 @@ from service.compute.planning.motion_plan import (
     PlanningScene,
     Progress,
     best_posture,
+    depth_of_field,
     plan_motion,
     travel_times_s,
 )
-from service.compute.planning.optics import depth_of_field
 from service.core.arms.known import known_arm
 from service.core.arms.model import ArmModel
 from service.core.arms.motion_limits import motion_problems

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import CalibrationTargets
+from service.compute.board.board import Board
+from service.compute.board.design import CalibrationTargets
 from service.compute.planning.motion_plan import best_posture
 from service.core.arms.known import known_arm
 from service.core.errors import ConfigurationError

@@ -28,8 +28,8 @@ from service.steps.inputs import EarlierAnswer, captured_images, earlier_answer
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
 
 if TYPE_CHECKING:
-    from service.compute.calibration.board.board import Board
-    from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+    from service.compute.board.board import Board
+    from service.compute.board.knowledge import BoardKnowledge
     from service.steps.board.capture import BoardCapture
 
 _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of it are used
@@ -166,7 +166,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 def board_of_protocol(context: StepContext) -> Board:
     """The protocol's board. Raises ConfigurationError if it describes none."""
-    from service.compute.calibration.board.board import Board  # noqa: PLC0415 - as above
+    from service.compute.board.board import Board  # noqa: PLC0415 - as above
 
     board = context.protocol.board
     if board is None:

@@ -19,8 +19,8 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, taken_utc_s
-from service.compute.images.files import read_grey, read_image
-from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.images.photographs import read_grey, read_image
+from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.import_folder import camera_record
 from service.store.events import canonical
 from service.web.record.pictures import reduced_jpeg
@@ -220,7 +220,7 @@ TARGETS: tuple[Target, ...] = (
         lambda data, folder: check_jpeg_complete(_put(folder, "DSC00007.JPG", data)),
         _jpegs,
     ),
-    Target("image", "service.compute.images.files:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
+    Target("image", "service.compute.images.photographs:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
     Target("web_picture", "service.web.record.pictures:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
     Target("mesh_ply", "drivers.meshes.mesh_file:read_mesh_file", _mesh("ply"), _plys, (*BYTES, *TEXT)),
     Target("mesh_stl", "drivers.meshes.mesh_file:read_mesh_file", _mesh("stl"), _stls, (*BYTES, *TEXT)),
@@ -238,14 +238,14 @@ TARGETS: tuple[Target, ...] = (
     Target("dicom", "drivers.dicom_folder.folder:DicomFolder", _series, _slices, (*BYTES, *TEXT), pace=0.5),
     Target(
         "image_features",
-        "service.compute.poses.sfm.features:ImageFeatures.from_bytes",
+        "service.compute.sfm.features:ImageFeatures.from_bytes",
         lambda data, _: ImageFeatures.from_bytes(data),
         _features,
         says_place=False,
     ),
     Target(
         "image_matches",
-        "service.compute.poses.sfm.features:unpack_matches",
+        "service.compute.sfm.features:unpack_matches",
         lambda data, _: unpack_matches(data),
         _matches,
         says_place=False,

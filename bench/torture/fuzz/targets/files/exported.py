@@ -19,11 +19,8 @@ from service.benchmark.matching_results import MethodResult, markdown, read_resu
 from service.benchmark.methods import from_unit_box, methods
 from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Score, read_results
 from service.benchmark.table import table_markdown
-from service.compute.ground_truth.ply import read_ply, write_ply
-from service.compute.ground_truth.surface import Surface
-from service.compute.matching.scores.evaluate import LoadedViews, PairScore
-from service.compute.matching.scores.matches import PRECISION_PX
-from service.compute.matching.scores.pose import PoseError
+from service.compute.ground_truth.surface import Surface, read_ply, write_ply
+from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
 from service.core.text.json_text import parse_json
 from service.dataset.export_folder import SUMS
 from service.dataset.exported import data_set_of_folder
@@ -225,7 +222,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("benchmark_result", "service.benchmark.records:read_results", _result, _results, JSON),
     Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
-    Target("own_ply", "service.compute.ground_truth.ply:read_ply", _ply, _plys),
+    Target("own_ply", "service.compute.ground_truth.surface:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview_records:read_preview", _preview, _previews, JSON),
     Target("export_request", "service.audit.export.exports:kept_request", _request, _requests, JSON),
     Target("region", "service.run_acts:read_region", _region, _regions, JSON),

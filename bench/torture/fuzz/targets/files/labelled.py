@@ -16,7 +16,7 @@ from drivers.dicom_folder.deidentify import deidentify
 from drivers.dicom_folder.folder import DicomFolder
 from drivers.dicom_receiver.staging import Staging
 from service.compute.camera_model import CameraModel
-from service.compute.poses.ros.messages import (
+from service.compute.poses.ros_messages import (
     DEFINITIONS,
     StampedImage,
     StampedTransform,
@@ -25,7 +25,7 @@ from service.compute.poses.ros.messages import (
     encode_pose,
     encode_tf,
 )
-from service.compute.poses.ros.recording import read_recording
+from service.compute.poses.ros_recording import read_recording
 
 _NIFTI_BYTES = 352
 
@@ -180,5 +180,5 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("deidentify", "drivers.dicom_folder.deidentify:deidentify", _clean, _slices, (*BYTES, *TEXT)),
     Target("received_uids", "drivers.dicom_receiver.staging:Staging", _stored, _uids, (*BYTES, *TEXT)),
-    Target("ros_recording", "service.compute.poses.ros.recording:read_recording", _recording, _recordings),
+    Target("ros_recording", "service.compute.poses.ros_recording:read_recording", _recording, _recordings),
 )

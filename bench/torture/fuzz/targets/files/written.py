@@ -14,17 +14,11 @@ import yaml
 from bench.machine import REPOSITORY
 from bench.torture.fuzz.mutations import JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
-from service.compute.arm.joint_file import read_joints_csv
 from service.compute.camera_model import CameraModel
-from service.compute.markers.search.paper_files import read_boxes
-from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
-from service.compute.poses.files.pose_files import (
-    read_colmap_model,
-    read_poses,
-    write_poses_csv,
-    write_transforms_json,
-)
-from service.compute.poses.files.robot_files import read_hand_eye, read_stations
+from service.compute.markers.paper import read_boxes
+from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
+from service.compute.poses.pose_files import read_colmap_model, read_poses, write_poses_csv, write_transforms_json
+from service.compute.poses.robot_files import read_hand_eye, read_joints_csv, read_stations
 from service.core.geometry import Transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList
@@ -229,60 +223,60 @@ TARGETS: tuple[Target, ...] = (
     Target("import_list", "service.rig:load_rig", _rig, _import_lists, JSON),
     Target(
         "poses_csv",
-        "service.compute.poses.files.pose_files:read_poses",
+        "service.compute.poses.pose_files:read_poses",
         lambda data, folder: _finite(read_poses(_put(folder, "poses.csv", data))),
         _pose_tables,
         TEXT,
     ),
     Target(
         "transforms_json",
-        "service.compute.poses.files.pose_files:read_poses",
+        "service.compute.poses.pose_files:read_poses",
         lambda data, folder: _finite(read_poses(_put(folder, "transforms.json", data))),
         _transforms,
         JSON,
     ),
     Target(
         "camera_json",
-        "service.compute.poses.files.camera_files:read_camera_json",
+        "service.compute.poses.camera_files:read_camera_json",
         lambda data, folder: read_camera_json(_put(folder, "camera.json", data)),
         _cameras,
         JSON,
     ),
     Target(
         "spheres_json",
-        "service.compute.poses.files.camera_files:read_spheres_json",
+        "service.compute.poses.camera_files:read_spheres_json",
         lambda data, folder: read_spheres_json(_put(folder, "spheres.json", data)),
         _spheres,
         JSON,
     ),
     Target(
         "joints_csv",
-        "service.compute.arm.joint_file:read_joints_csv",
+        "service.compute.poses.robot_files:read_joints_csv",
         lambda data, folder: read_joints_csv(_put(folder, "joints.csv", data), ["v0.jpg"]),
         _joint_tables,
         TEXT,
     ),
     Target(
         "stations_csv",
-        "service.compute.poses.files.robot_files:read_stations",
+        "service.compute.poses.robot_files:read_stations",
         lambda data, folder: read_stations(_put(folder, "stations.csv", data), ["v0.jpg"]),
         _station_tables,
         TEXT,
     ),
-    Target("hand_eye_json", "service.compute.poses.files.robot_files:read_hand_eye", _hand_eye, _hand_eyes, JSON),
+    Target("hand_eye_json", "service.compute.poses.robot_files:read_hand_eye", _hand_eye, _hand_eyes, JSON),
     Target(
         "boxes_json",
-        "service.compute.markers.search.paper_files:read_boxes",
+        "service.compute.markers.paper:read_boxes",
         lambda data, folder: read_boxes(_put(folder, "boxes.json", data), [f"v{k}.jpg" for k in range(3)]),
         _box_files,
         JSON,
     ),
     Target(
-        "colmap_text", "service.compute.poses.files.pose_files:read_colmap_model", _text_model, _text_models, TEXT,
+        "colmap_text", "service.compute.poses.pose_files:read_colmap_model", _text_model, _text_models, TEXT,
         memory_mib=1024, seconds=20.0, pace=0.02,
     ),
     Target(
-        "colmap_binary", "service.compute.poses.files.pose_files:read_colmap_model", _binary_model, _binary_models,
+        "colmap_binary", "service.compute.poses.pose_files:read_colmap_model", _binary_model, _binary_models,
         memory_mib=1024, seconds=20.0, pace=0.02,
     ),
 )  # fmt: skip

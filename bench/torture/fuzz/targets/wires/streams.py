@@ -12,8 +12,8 @@ from bench.machine import REPOSITORY
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from drivers.kuka.fri.wire import FriError, decode
 from service.compute.camera_model import CameraModel
-from service.compute.poses.ros.cdr import CdrError
-from service.compute.poses.ros.messages import (
+from service.compute.poses.ros_messages import (
+    CdrError,
     StampedImage,
     StampedTransform,
     decode_camera_info,
@@ -80,6 +80,6 @@ def _message(data: bytes, _: Path) -> None:
 TARGETS: tuple[Target, ...] = (
     Target("fri", "drivers.kuka.fri.wire:decode", _datagram, _datagrams, errors=(FriError,), says_place=False),
     Target(
-        "ros_message", "service.compute.poses.ros.messages", _message, _messages, errors=(CdrError,), says_place=False
+        "ros_message", "service.compute.poses.ros_messages", _message, _messages, errors=(CdrError,), says_place=False
     ),
 )

@@ -1,0 +1,279 @@
+"""Computes the kinematics of arms from their Denavit–Hartenberg parameters: forward, derivatives, and inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from service.compute.descent import Damping, largest, levenberg_marquardt
+from service.core import seven_axes
+from service.core.arms.known import known_arms
+from service.core.arms.model import ArmModel
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, to_rotation_vector
+
+_LONGEST_STEP_RAD = 0.4
+_REACHED = 1e-7  # m and rad
+_SAME_TOOL_M, _SAME_TOOL_RAD = 0.01, 0.01  # between the tools of most poses, if they are one
+
+
+def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:
+    """The arm whose forward kinematics fit the reported poses best; None if none is within `within_m`.
+
+    Of arms with the same dimensions, such as KUKA's LBR iiwa 14 and LBR Med 14, it is the first.
+
+    Args:
+        joints_rad: (N, J); only arms of J axes are considered.
+        T_base_flange: (N, 4, 4) as reported by the controller with the tool centre point at the flange.
+        within_m: largest accepted median distance of the positions.
+    """
+    best, best_m = None, within_m
+    for arm in (arm for arm in known_arms() if arm.axes == joints_rad.shape[1]):
+        apart = forward(arm, joints_rad)[:, :3, 3] - T_base_flange[:, :3, 3]
+        median = float(np.median(np.linalg.norm(apart, axis=1)))
+        if median < best_m:
+            best, best_m = arm, median
+    return best
+
+
+def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transform] | None:
+    """The arm and its tool T_flange_tool whose poses these are; None if no known arm with one fixed tool has them.
+
+    Args:
+        joints_rad: (N, J).
+        T_base_tool: (N, 4, 4) as reported by a controller with an active tool centre point.
+    """
+    best: tuple[float, ArmModel, Transform] | None = None
+    for arm in (arm for arm in known_arms() if arm.axes == joints_rad.shape[1]):
+        tools = np.array([inverse(T) for T in forward(arm, joints_rad)]) @ T_base_tool
+        usual = tools[np.argsort(tools[:, 0, 3])[len(tools) // 2]]
+        apart_m = float(np.median(np.linalg.norm(tools[:, :3, 3] - usual[:3, 3], axis=1)))
+        turn_rad = float(np.median([rotation_angle_rad(inverse(usual) @ tool) for tool in tools]))
+        if apart_m < _SAME_TOOL_M and turn_rad < _SAME_TOOL_RAD and (best is None or apart_m < best[0]):
+            best = apart_m, arm, usual
+    return None if best is None else best[1:]
+
+
+def chain(values: Array) -> Array:
+    """(N, J + 1, 4, 4) T_base_0 … T_base_J from values (N, J, 4 or 5) in the order a, d, α, θ and, if given, β.
+
+    T_(i-1)_i = Rz(θ) Tz(d) Tx(a) Ry(β) Rx(α).
+    """
+    axes = values.shape[1]
+    frames = np.zeros((len(values), axes + 1, 4, 4))
+    frames[:, 0] = np.eye(4)
+    for i in range(axes):
+        a, d, alpha, theta = values[:, i, :4].T
+        ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+        zero, one = np.zeros_like(a), np.ones_like(a)
+        link = np.array(
+            [
+                [ct, -st * ca, st * sa, a * ct],
+                [st, ct * ca, -ct * sa, a * st],
+                [zero, sa, ca, d],
+                [zero, zero, zero, one],
+            ]
+        ).transpose(2, 0, 1)
+        if values.shape[2] == 5:
+            cb, sb = np.cos(values[:, i, 4]), np.sin(values[:, i, 4])
+            turn = np.array([[cb, sb * sa, sb * ca], [zero, ca, -sa], [-sb, cb * sa, cb * ca]])
+            spin = np.array([[ct, -st, zero], [st, ct, zero], [zero, zero, one]])
+            link[:, :3, :3] = spin.transpose(2, 0, 1) @ turn.transpose(2, 0, 1)
+        frames[:, i + 1] = frames[:, i] @ link
+    return frames
+
+
+def forward(arm: ArmModel, joints_rad: Array) -> Array:
+    """(N, 4, 4) T_base_flange at joints (N, J) with the nominal parameters."""
+    return chain(arm.joint_values(_joints(arm, joints_rad)))[:, -1]
+
+
+def dh_jacobian(frames: Array) -> Array:
+    """(N, 6, 4 J) derivative of the flange's pose by a, d, α, θ of joint 1, of joint 2, …
+
+    The pose increment is (d in metres, w in radians) in the flange's axes, about its origin.
+
+    Args:
+        frames: (N, J + 1, 4, 4) as from `chain`.
+    """
+    axes = frames.shape[1] - 1
+    R_flange, flange = frames[:, -1, :3, :3], frames[:, -1, :3, 3]
+    J = np.zeros((len(frames), 6, 4 * axes))
+    to_flange = np.swapaxes(R_flange, 1, 2)
+    for i in range(axes):
+        z, before = frames[:, i, :3, 2], frames[:, i, :3, 3]
+        x, after = frames[:, i + 1, :3, 0], frames[:, i + 1, :3, 3]
+        columns = (
+            (x, np.zeros_like(x)),
+            (z, np.zeros_like(z)),
+            (np.cross(x, flange - after), x),
+            (np.cross(z, flange - before), z),
+        )
+        for k, (shift, turn) in enumerate(columns):
+            J[:, :3, 4 * i + k] = np.einsum("nij,nj->ni", to_flange, shift)
+            J[:, 3:, 4 * i + k] = np.einsum("nij,nj->ni", to_flange, turn)
+    return J
+
+
+def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:
+    """(N, 6, K) derivative of the flange's pose by β of K joints, in the form of `dh_jacobian`.
+
+    Args:
+        frames: (N, J + 1, 4, 4) as from `chain`.
+        joints: of the axes to which the next is parallel, from 0.
+    """
+    flange = frames[:, -1, :3, 3]
+    to_flange = np.swapaxes(frames[:, -1, :3, :3], 1, 2)
+    J = np.zeros((len(frames), 6, len(joints)))
+    for k, i in enumerate(joints):
+        y = np.cross(frames[:, i, :3, 2], frames[:, i + 1, :3, 0])
+        J[:, :3, k] = np.einsum("nij,nj->ni", to_flange, np.cross(y, flange - frames[:, i + 1, :3, 3]))
+        J[:, 3:, k] = np.einsum("nij,nj->ni", to_flange, y)
+    return J
+
+
+def solve_joints(arm: ArmModel, T_base_flange: Transform, starts_rad: Array) -> Array | None:
+    """Joints (J,) that reach a pose, by damped Newton steps from each start (S, J) in turn; None if none converges.
+
+    The result is within the limits. For planning only: whether the arm reaches the pose in a posture near the starts.
+    Every step is taken with the same damping, since on a long way round the error may grow for a while.
+    """
+
+    def at(q: Array) -> _Reach:
+        frames = chain(arm.joint_values(q[None]))
+        return _Reach(q, frames, to_rotation_vector(inverse(frames[0, -1]) @ T_base_flange))
+
+    def candidate(here: _Reach, damping: float) -> _Reach:
+        J = dh_jacobian(here.frames)[0, :, 3::4]
+        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), here.error)
+        return at(here.q + step * min(1.0, _LONGEST_STEP_RAD / max(largest(step), 1e-12)))
+
+    for start in np.atleast_2d(starts_rad):
+        found = levenberg_marquardt(
+            at(np.array(start, dtype=np.float64)),
+            candidate,
+            lambda _here, _there: 0.0,
+            lambda _here, there: largest(there.error) < _REACHED,
+            damping=Damping(1e-6, down=1.0),
+            most=40,
+        )
+        if found.settled:
+            return found.state.q if bool(np.all(np.abs(found.state.q) <= arm.limits_rad)) else None
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """Joints (J,), the frames of their links, and the pose's error (6,) there, m and rad."""
+
+    q: Array
+    frames: Array
+    error: Array
+
+
+def pose_gap(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> tuple[float, float]:
+    """Median distance (m) and angle (rad) between forward kinematics and the reported poses (N, 4, 4).
+
+    Raises:
+        DataError: the numbers of joints and poses differ.
+    """
+    joints = _joints(arm, joints_rad)
+    if len(joints) != len(T_base_flange):
+        raise DataError(f"{len(joints)} joint positions for {len(T_base_flange)} poses")
+    gap = np.array([inverse(a) @ b for a, b in zip(forward(arm, joints), T_base_flange, strict=True)])
+    turn = [rotation_angle_rad(T) for T in gap]
+    return float(np.median(np.linalg.norm(gap[:, :3, 3], axis=1))), float(np.median(turn))
+
+
+def _joints(arm: ArmModel, joints_rad: Array) -> Array:
+    joints = np.asarray(joints_rad, dtype=np.float64)
+    if joints.ndim != 2 or joints.shape[1] != arm.axes or not np.isfinite(joints).all():
+        raise DataError(f"joint positions {joints.shape}, (N, {arm.axes}) finite numbers are needed for a {arm.name}")
+    return joints
+
+
+_REACH_TOLERANCE = 1e-9
+# Of the squared turns. The last joint turns little but the camera about itself: a whole turn of it is better than
+# another side of shoulder, elbow or wrist, from which the ways to the next poses are long or blocked.
+_WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.25])
+
+
+def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
+    """Joints (K, N) within ±180° and the limits that reach a pose; an empty array if there are none.
+
+    Up to eight for six axes; for seven, those of elbow angles all round.
+    """
+    if arm.family == "seven_axes":
+        return seven_axes.postures(arm, T_base_flange)
+    found = _universal_robot(arm, T_base_flange)
+    return found[np.all(np.abs(found) <= arm.limits_rad, axis=1)]
+
+
+def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
+    """Joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
+
+    The turn of the last of six axes counts half. With seven axes nearness is weighed against room to limits and
+    singularities.
+    """
+    if arm.family == "seven_axes":
+        return seven_axes.postures_by_cost(arm, T_base_flange, near_rad)
+    found = _universal_robot(arm, T_base_flange)
+    found = found + 2 * np.pi * np.round((near_rad - found) / (2 * np.pi))
+    found = np.where(np.abs(found) > arm.limits_rad, found - 2 * np.pi * np.sign(found), found)
+    found = found[np.all(np.abs(found) <= arm.limits_rad, axis=1)]
+    return found[np.argsort((found - near_rad) ** 2 @ _WEIGHTS, kind="stable")]
+
+
+def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
+    """The first of `postures_near`; None if the pose is out of reach."""
+    found = postures_near(arm, T_base_flange, near_rad)
+    return found[0] if len(found) else None
+
+
+def _universal_robot(arm: ArmModel, T_base_flange: Transform) -> Array:
+    """Joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
+
+    The eight are shoulder left or right, wrist up or down, elbow up or down. Where the last axis is parallel to the
+    second, its angle is free and taken as 0.
+
+    Source: K. P. Hawkins, "Analytic Inverse Kinematics for the Universal Robots UR-5/UR-10 Arms", Georgia Institute
+    of Technology, 2013, for the DH parameters of `ArmModel`.
+    """
+    a2, a3 = float(arm.a_m[1]), float(arm.a_m[2])
+    d4, d6 = float(arm.d_m[3]), float(arm.d_m[5])
+    wrist = T_base_flange[:3, 3] - d6 * T_base_flange[:3, 2]
+    radius = float(np.hypot(wrist[0], wrist[1]))
+    if radius < d4:
+        return np.zeros((0, 6))
+    found: list[Array] = []
+    for shoulder, wrist_side in product((1, -1), (1, -1)):
+        q1 = float(np.arctan2(wrist[1], wrist[0])) + shoulder * float(np.arccos(d4 / radius)) + np.pi / 2
+        s1, c1 = np.sin(q1), np.cos(q1)
+        cosine5 = float((T_base_flange[0, 3] * s1 - T_base_flange[1, 3] * c1 - d4) / d6)
+        if abs(cosine5) > 1 + _REACH_TOLERANCE:
+            continue
+        q5 = wrist_side * float(np.arccos(np.clip(cosine5, -1, 1)))
+        s5, q6 = np.sin(q5), 0.0
+        if abs(s5) > 1e-9:
+            x, y = T_base_flange[:3, 0], T_base_flange[:3, 1]
+            q6 = float(np.arctan2((-y[0] * s1 + y[1] * c1) / s5, (x[0] * s1 - x[1] * c1) / s5))
+        T_1_4 = inverse(_link(arm, 0, q1)) @ T_base_flange @ inverse(_link(arm, 4, q5) @ _link(arm, 5, q6))
+        px, py = T_1_4[0, 3] - d4 * T_1_4[0, 1], T_1_4[1, 3] - d4 * T_1_4[1, 1]
+        cosine3 = float((px**2 + py**2 - a2**2 - a3**2) / (2 * a2 * a3))
+        if abs(cosine3) > 1 + _REACH_TOLERANCE:
+            continue
+        for elbow in (1, -1):
+            q3 = elbow * float(np.arccos(np.clip(cosine3, -1, 1)))
+            q2 = float(np.arctan2(py, px)) - float(np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3)))
+            T_3_4 = inverse(_link(arm, 1, q2) @ _link(arm, 2, q3)) @ T_1_4
+            found.append(np.array([q1, q2, q3, np.arctan2(T_3_4[1, 0], T_3_4[0, 0]), q5, q6]))
+    return np.mod(np.array(found).reshape(-1, 6) + np.pi, 2 * np.pi) - np.pi
+
+
+def _link(arm: ArmModel, i: int, angle: float) -> Transform:
+    c, s = np.cos(angle), np.sin(angle)
+    ca, sa, a, d = np.cos(arm.alpha_rad[i]), np.sin(arm.alpha_rad[i]), arm.a_m[i], arm.d_m[i]
+    return np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])

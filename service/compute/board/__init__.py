@@ -1,0 +1,1 @@
+"""Calibration boards: their points in images, and the poses from which they are photographed."""

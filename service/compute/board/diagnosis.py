@@ -1,0 +1,323 @@
+"""Diagnoses why a board is not found, by trying the usual mistakes: counts, printing, dictionary, cropping."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+
+from service.compute.board.board import Board, Grey
+from service.core.geometry import Array
+from service.core.units import mm
+
+_WIDTH = 1200  # px, of the reduced copies
+_CHARUCO_WIDTH = 1600
+_LEAST = 3  # corners per side for a grid to count as a board
+_FEWEST_MARKERS = 4
+_BORDER = 1.6  # corner spacings between the last visible corner and the frame: the next one would be outside
+_FEWEST_CORNERS = 8
+_FEWEST_CIRCLES = 12
+_ROUND = 0.85  # circularity of a dark spot that is no square: a square has 0.79, a circle at 45° 0.9
+_MARKER_OFF = 0.05  # relative error of a marker's side that is told
+_DICTIONARIES = tuple(
+    sorted(
+        (name for name in dir(cv2.aruco) if name.startswith("DICT_") and "APRILTAG" not in name),
+        key=lambda name: (name.rsplit("_", 1)[0], len(name), name),
+    )
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What an image shows instead of the described board.
+
+    Attributes:
+        words: for people, without a full stop.
+        remedy: what to do.
+        of_board: whether the description is wrong, and so fails for every image; otherwise only this image is at
+            fault.
+    """
+
+    words: str
+    remedy: str
+    of_board: bool
+
+
+def diagnose(image: Grey, board: Board) -> Diagnosis | None:
+    """Why `find_board` may have found nothing; None if none of the usual mistakes explains it.
+
+    Takes a fraction of a second for a checkerboard and some seconds for a ChArUco board.
+    """
+    if board.pattern == "checkerboard":
+        return _checkerboard(image, board)
+    return _charuco(image, board) if board.pattern == "charuco" else _circles(image, board)
+
+
+def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
+    """The mistake in the board's description that explains two of these images; None if any image shows the board.
+
+    A single image may just show a partly covered board, so one is enough only if there is no other.
+    """
+    said: list[Diagnosis] = []
+    for image in images:
+        if _is_seen(image, board):
+            return _wrong_markers(images, board) if board.pattern == "charuco" else None
+        found = diagnose(image, board)
+        if found is not None and found.of_board:
+            if found in said or len(images) == 1:
+                return found
+            said.append(found)
+    return None
+
+
+def _is_seen(image: Grey, board: Board) -> bool:
+    if board.pattern == "checkerboard":
+        seen = _seen(_small(image, _WIDTH))
+        return seen is not None and sorted(seen[0]) == sorted((board.columns, board.rows))
+    if board.pattern == "charuco":
+        return _corners(_small(image, _CHARUCO_WIDTH), board) >= _FEWEST_CORNERS
+    size = (board.columns, board.rows)
+    return cv2.findCirclesGrid(_small(image, _WIDTH), size, flags=cv2.CALIB_CB_ASYMMETRIC_GRID)[0]
+
+
+def _small(image: Grey, width: int) -> Grey:
+    factor = width / max(image.shape)
+    if factor >= 1:
+        return image
+    size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+# --- checkerboard -----------------------------------------------------------------------------------------
+
+
+def _seen(image: Grey) -> tuple[tuple[int, int], Array] | None:
+    """Columns and rows of the largest corner grid in the image, and the corners (rows, columns, 2)."""
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST, _LEAST), flags)
+    if not found:
+        return None
+    rows, columns = meta.shape[:2]
+    return (columns, rows), np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)
+
+
+def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
+    small = _small(image, _WIDTH)
+    seen = _seen(small)
+    wanted, given = sorted((board.columns, board.rows)), f"{board.columns} × {board.rows}"
+    if (seen is None or sorted(seen[0]) == [_LEAST, _LEAST]) and _circles_in(small) >= _FEWEST_CIRCLES:
+        return Diagnosis(
+            "the image shows circles, not squares",
+            "Give --pattern circles, the circles of one row and the rows (an asymmetric grid; symmetric ones are "
+            "not read)",
+            True,
+        )
+    if seen is None:
+        if _best_dictionary(_small(image, _CHARUCO_WIDTH))[1] >= _FEWEST_MARKERS:
+            return Diagnosis(
+                "there are markers in the squares: it is a ChArUco board", "Give --pattern charuco", True
+            )
+        return None
+    (columns, rows), corners = seen
+    found = sorted((columns, rows))
+    if found == wanted:
+        return None  # the board is there; find_board's own reason holds
+    if _at_frame(corners, small.shape) and all(a <= b for a, b in zip(found, wanted, strict=True)):
+        return Diagnosis(
+            f"the board is cropped by the image's edge: {columns} × {rows} of its {given} inner corners are seen",
+            "The whole board must be in the image",
+            False,
+        )
+    # Report the counts in the order in which the description gives them.
+    first, second = found if board.columns <= board.rows else found[::-1]
+    words = f"the board has {first} × {second} inner corners, not {given}"
+    if found == [wanted[0] - 1, wanted[1] - 1]:
+        words += ", which counts its squares"
+    return Diagnosis(words, f"Inner corners are where four squares meet: give {first}x{second}", True)
+
+
+def _at_frame(corners: Array, shape: tuple[int, ...]) -> bool:
+    """Whether the next row or column of corners would lie outside the image."""
+    spacing = max(
+        float(np.median(np.linalg.norm(np.diff(corners, axis=0), axis=2))),
+        float(np.median(np.linalg.norm(np.diff(corners, axis=1), axis=2))),
+    )
+    flat = corners.reshape(-1, 2)
+    gap = min(float(flat.min()), float((np.array(shape[1::-1]) - flat).min()))
+    return gap < _BORDER * spacing
+
+
+# --- ChArUco ----------------------------------------------------------------------------------------------
+
+
+def _charuco(image: Grey, board: Board) -> Diagnosis | None:
+    small = _small(image, _CHARUCO_WIDTH)
+    name, best = _best_dictionary(small)
+    own = _markers(small, board.dictionary)
+    if best >= _FEWEST_MARKERS and best > 2 * own:
+        return Diagnosis(
+            f"the markers are of {name}, not of {board.dictionary}",
+            f"Give --dictionary {name}",
+            True,
+        )
+    if own < _FEWEST_MARKERS:
+        seen = _seen(_small(image, _WIDTH))
+        if seen is not None and min(seen[0]) > _LEAST:
+            return Diagnosis("the image shows a board without markers", "Give --pattern checkerboard", True)
+        return None
+    now = _corners(small, board)
+    for other, words, remedy in _variants(board):
+        if _corners(small, other) >= max(_FEWEST_CORNERS, 2 * now):
+            return Diagnosis(words, remedy, True)
+    return None
+
+
+def _variants(board: Board) -> list[tuple[Board, str, str]]:
+    """Boards that are often confused, each with the mistake in words and the option that corrects it."""
+    c, r = board.columns, board.rows
+    counts = (
+        ((c, r), ""),
+        ((r, c), "columns and rows are swapped"),
+        ((c - 1, r - 1), "squares were counted, not inner corners"),
+        ((r - 1, c - 1), "squares were counted, and columns and rows are swapped"),
+    )
+    out: list[tuple[Board, str, str]] = []
+    for (columns, rows), words in counts:
+        for legacy in (board.legacy, not board.legacy):
+            if min(columns, rows) < _LEAST or ((columns, rows) == (c, r) and legacy == board.legacy):
+                continue
+            other = dataclasses.replace(board, columns=columns, rows=rows, legacy=legacy)
+            printed = "" if legacy == board.legacy else _LEGACY_WORDS[legacy]
+            give = "" if (columns, rows) == (c, r) else f"--board {columns}x{rows}"
+            switch = "" if legacy == board.legacy else "--legacy" if legacy else "no --legacy"
+            out.append(
+                (
+                    other,
+                    ", and ".join(part for part in (words, printed) if part),
+                    "Give " + " and ".join(part for part in (give, switch) if part),
+                )
+            )
+    return out
+
+
+def _wrong_markers(images: Sequence[Grey], board: Board) -> Diagnosis | None:
+    """The true side of a ChArUco board's markers if another one is described."""
+    ratios = [ratio for image in images for ratio in _marker_ratios(_small(image, _CHARUCO_WIDTH), board)]
+    if not ratios or abs(float(np.median(ratios)) - 1) < _MARKER_OFF:
+        return None
+    given = mm(board.charuco().getMarkerLength())
+    found = float(np.median(ratios)) * given
+    return Diagnosis(
+        f"the markers have sides of {found:.1f} mm, not {given:.1f} mm, in squares of {mm(board.square_m):g} mm",
+        f"Measure a marker and give --marker-mm {found:.1f}",
+        True,
+    )
+
+
+def _marker_ratios(image: Grey, board: Board) -> Array:
+    """True over described side of every marker in an image whose place on the board is known."""
+    described = board.charuco()
+    corners, identifiers, _ = _marker_detector(board.dictionary).detectMarkers(image)
+    if identifiers is None or len(identifiers) < _FEWEST_MARKERS:  # pyright: ignore[reportUnnecessaryComparison]
+        return np.zeros(0)
+    places = dict(zip(np.asarray(described.getIds()).ravel().tolist(), described.getObjPoints(), strict=True))
+    known = [(np.asarray(c, dtype=np.float64).reshape(4, 2), places[i]) for c, i in
+             zip(corners, np.asarray(identifiers).ravel().tolist(), strict=True) if i in places]  # fmt: skip
+    if len(known) < _FEWEST_MARKERS:
+        return np.zeros(0)
+    seen, at = np.array([c for c, _ in known]), np.array([np.asarray(p)[:, :2] for _, p in known])
+    H, inlier = cv2.findHomography(seen.mean(axis=1), at.mean(axis=1), cv2.RANSAC, 0.1 * board.square_m)
+    if H is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return np.zeros(0)
+    flat = cv2.perspectiveTransform(seen[inlier.ravel() > 0].reshape(1, -1, 2), H).reshape(-1, 4, 2)
+    sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2).mean(axis=1)
+    return np.asarray(sides, dtype=np.float64) / described.getMarkerLength()
+
+
+def _marker_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)), parameters)
+
+
+_LEGACY_WORDS = {
+    True: "it is printed as OpenCV did before version 4.6",
+    False: "it is printed as OpenCV does since version 4.6",
+}
+
+
+def _corners(image: Grey, board: Board) -> int:
+    """Number of corners that lie on one plane in this board's arrangement."""
+    try:
+        found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(image)
+    except cv2.error:
+        return 0
+    if identifiers is None or len(identifiers) < 4:  # pyright: ignore[reportUnnecessaryComparison]
+        return 0
+    points = board.points()[np.asarray(identifiers, dtype=np.int64).ravel(), :2]
+    pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    _, inlier = cv2.findHomography(points, pixels, cv2.RANSAC, 3.0)
+    return 0 if inlier is None else int(np.count_nonzero(inlier))  # pyright: ignore[reportUnnecessaryComparison]
+
+
+def _markers(image: Grey, dictionary: str) -> int:
+    identifier = getattr(cv2.aruco, dictionary, None)
+    if not isinstance(identifier, int):
+        return 0
+    found = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(identifier)).detectMarkers(image)[1]
+    return 0 if found is None else len(np.unique(found))  # pyright: ignore[reportUnnecessaryComparison]
+
+
+def _best_dictionary(image: Grey) -> tuple[str, int]:
+    """The dictionary with the most markers in the image (the smallest one in a tie), and their number."""
+    # Quadrilaterals are searched for once, and compared with all dictionaries.
+    _, identifiers, _, dictionary = _detector_of_all().detectMarkersMultiDict(image)
+    best = ("", 0)
+    if identifiers is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return best
+    for k, name in enumerate(_DICTIONARIES):
+        if (count := len(np.unique(np.asarray(identifiers)[np.asarray(dictionary) == k]))) > best[1]:
+            best = (name, count)
+    return best
+
+
+@cache
+def _detector_of_all() -> cv2.aruco.ArucoDetector:
+    """A detector that knows all dictionaries, in their order."""
+    known = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in _DICTIONARIES]
+    return cv2.aruco.ArucoDetector(known, cv2.aruco.DetectorParameters(), cv2.aruco.RefineParameters())
+
+
+# --- circles ----------------------------------------------------------------------------------------------
+
+
+def _circles_in(image: Grey) -> int:
+    """Number of dark round spots."""
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.minArea, settings.maxArea = 20, image.size / 100
+    settings.filterByCircularity, settings.minCircularity = True, _ROUND
+    settings.minDistBetweenBlobs = 4
+    return len(cv2.SimpleBlobDetector.create(settings).detect(image))
+
+
+def _circles(image: Grey, board: Board) -> Diagnosis | None:
+    small = _small(image, _WIDTH)
+    if cv2.findCirclesGrid(small, (board.rows, board.columns), flags=cv2.CALIB_CB_ASYMMETRIC_GRID)[0]:
+        return Diagnosis(
+            "columns and rows are swapped",
+            f"Give --board {board.rows}x{board.columns}: the circles of one row, then the rows",
+            True,
+        )
+    for size in ((board.columns, board.rows), (board.rows, board.columns)):
+        if cv2.findCirclesGrid(small, size, flags=cv2.CALIB_CB_SYMMETRIC_GRID)[0]:
+            return Diagnosis(
+                "the circles lie in a symmetric grid", "Print an asymmetric one; symmetric ones are not read", True
+            )
+    seen = _seen(small)
+    if seen is not None and min(seen[0]) > _LEAST and _circles_in(small) < _FEWEST_CIRCLES:
+        return Diagnosis("the image shows squares, not circles", "Give --pattern checkerboard", True)
+    return None

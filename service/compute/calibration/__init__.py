@@ -1,1 +1,0 @@
-"""Camera intrinsics and hand-eye from images of a calibration board."""

@@ -1,1 +1,0 @@
-"""Calibration boards and their corners in images."""

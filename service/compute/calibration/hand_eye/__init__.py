@@ -1,1 +1,0 @@
-"""Hand-eye calibration: closed form, weighted fit, validation and records."""

@@ -1,1 +1,0 @@
-"""Results while images are being taken: the provisional registration, and hand-held views."""

@@ -1,1 +1,0 @@
-"""Contradictions between the inputs of a registration: found, named, and counted in its uncertainty."""

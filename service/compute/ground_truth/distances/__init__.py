@@ -1,1 +1,0 @@
-"""Distances between two surfaces: Chamfer distance, F-score, point to surface, heat maps."""

@@ -1,1 +1,0 @@
-"""Fusion of CT and scan into one ground-truth mesh."""

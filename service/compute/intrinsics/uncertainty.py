@@ -1,0 +1,362 @@
+"""Says how good a calibration is: its projection uncertainty over the image, cross-validation, and warnings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.board.board import Board, BoardView
+from service.compute.camera_model import CameraModel
+from service.compute.intrinsics.adjustment import Adjustment, adjust, fit_pose, project_with_jacobian, rms
+from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics, leave_one_out, surface_of
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, place_jacobian
+from service.core.units import mm
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectionUncertainty:
+    """Standard deviation of a projected point in its worst direction, on a grid over the image.
+
+    Attributes:
+        distance_m: of the points along the optical axis.
+        pixels: (rows, columns, 2) positions of the grid.
+        sigma_px: (rows, columns).
+        sigma_mm: (rows, columns) the same at that distance, perpendicular to the line of sight.
+        centre_px: at the middle of the image.
+        worst_px: largest over the image.
+        rms_px: root mean square over the image.
+        centre_mm: at the middle of the image.
+        worst_mm: largest over the image.
+        rms_mm: root mean square over the image.
+    """
+
+    distance_m: float
+    pixels: Array
+    sigma_px: Array
+    sigma_mm: Array
+    centre_px: float
+    worst_px: float
+    rms_px: float
+    centre_mm: float
+    worst_mm: float
+    rms_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatedCamera:
+    """A camera as determined by board images: the input of its projection uncertainty.
+
+    Attributes:
+        camera: with `len(adjustment.parameters)` estimated parameters.
+        board: the board in the images.
+        corners: (N) the board's points in each image.
+        adjustment: the equations at the solution.
+        covariance: (Q, Q) of the unknowns: the parameters, then the terms of the board's bow.
+        bends: (K, S) displacement along the board's normal of each of its points by these terms; S may be 0.
+        variance: of one coordinate of a corner, px².
+    """
+
+    camera: CameraModel
+    board: Board
+    corners: tuple[BoardView, ...]
+    adjustment: Adjustment
+    covariance: Array
+    bends: Array
+    variance: float
+
+
+def board_distance_m(result: IntrinsicsResult) -> float:
+    """Median distance of the board's middle along the optical axis, m."""
+    middle = np.append(result.board.points().mean(axis=0), 1.0)
+    return float(np.median((result.T_camera_board @ middle)[:, 2]))
+
+
+def projection_uncertainty(
+    result: IntrinsicsResult, distance_m: float, *, columns: int = 24, rows: int = 16
+) -> ProjectionUncertainty:
+    """Effect of the calibration's errors on projected points, without the part that the camera's pose absorbs.
+
+    A calibration determines a camera *and* its poses: a wrong principal point acts like a rotated camera. So the
+    perturbed camera is first moved by the rigid motion that best aligns its view of the boards with the unperturbed
+    one, as any later pose estimation will do. To first order, with b the parameters, e_i the pose of view i, q(b, p)
+    the projection and p_ij the board's points in the camera frame:
+
+        db ~ N(0, s² S^-1),   de_i = E_i db + n_i,   n_i ~ N(0, s² C_i^-1)
+        dp_ij = L_ij de_i,    tau = argmin Σ |dp_ij - [I, -[p_ij]x] tau|² = K db + Σ H_i n_i
+        dq(p) = (dq/db + dq/dp [I, -[p]x] K) db + dq/dp [I, -[p]x] Σ H_i n_i
+
+    and the covariance of dq follows, with the scale s² of `result.covariance` (including inflation).
+    Source: Kogan, mrcal, "Projection uncertainty", the form with a fitted implied transformation.
+
+    Args:
+        result: from `calibrate_intrinsics`.
+        distance_m: of the plane z = distance in the camera frame on which the projected points lie.
+        columns: of the grid.
+        rows: of the grid.
+
+    Raises:
+        DataError: the distance is not positive.
+    """
+    variance = result.sigma_corner_px**2 * result.inflation
+    known = EstimatedCamera(
+        result.camera,
+        result.board,
+        result.corners,
+        result.adjustment,
+        result.joint_covariance,
+        surface_of(result.board).bends,
+        variance,
+    )
+    return uncertainty_of(known, distance_m, columns=columns, rows=rows)
+
+
+def uncertainty_of(
+    result: EstimatedCamera, distance_m: float, *, columns: int = 24, rows: int = 16
+) -> ProjectionUncertainty:
+    """`projection_uncertainty` for a camera determined by any images, including planned ones."""
+    if not 0 < distance_m < np.inf:
+        raise DataError(f"a distance of {distance_m} m is not in front of the camera")
+    K, noise = _implied_motion(result)
+    camera = result.camera
+    x = np.linspace(0, camera.width - 1, columns)
+    y = np.linspace(0, camera.height - 1, rows)
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    # The image's middle is added as one more point.
+    pixels = np.vstack([grid.reshape(-1, 2), [(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    rays = np.column_stack([camera.normalise(pixels), np.ones(len(pixels))])
+    points = rays * distance_m
+    _, by_pose, by_camera = project_with_jacobian(points, np.zeros(6), camera)
+    # At a zero rvec, OpenCV's derivatives by rvec and tvec are those of a small rotation and shift of the points.
+    J_motion = np.column_stack([by_pose[:, 3:], by_pose[:, :3]]).reshape(-1, 2, 6)
+    count, every = len(result.adjustment.parameters), len(result.covariance)
+    J_camera = np.zeros((len(pixels), 2, every))
+    J_camera[:, :, :count] = by_camera[:, :count].reshape(-1, 2, count)
+    A = J_camera + J_motion @ K
+    covariance = A @ result.covariance @ A.swapaxes(1, 2) + J_motion @ noise @ J_motion.swapaxes(1, 2)
+    sigma_px = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    # Back to the plane z = distance: dp = distance · (dq/dxy)^-1 dq.
+    by_point = by_pose[:, 3:].reshape(-1, 2, 3)[:, :, :2]
+    inverse = np.linalg.inv(by_point)
+    sigma_m = np.sqrt(np.linalg.eigvalsh(inverse @ covariance @ inverse.swapaxes(1, 2))[:, -1])
+    field_px, field_mm = sigma_px[:-1].reshape(rows, columns), mm(sigma_m[:-1].reshape(rows, columns))
+    return ProjectionUncertainty(
+        distance_m=distance_m,
+        pixels=grid,
+        sigma_px=field_px,
+        sigma_mm=field_mm,
+        centre_px=float(sigma_px[-1]),
+        worst_px=float(field_px.max()),
+        rms_px=float(np.sqrt(np.mean(field_px**2))),
+        centre_mm=mm(float(sigma_m[-1])),
+        worst_mm=float(field_mm.max()),
+        rms_mm=float(np.sqrt(np.mean(field_mm**2))),
+    )
+
+
+def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
+    """K (6, Q), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
+
+    A point p in the camera frame before a change of parameters and poses is at p + d + w x p after it.
+    """
+    board = result.board.points()
+    count = len(result.covariance)
+    normal = np.zeros((6, 6))
+    by_parameters = np.zeros((6, count))
+    spread = np.zeros((6, 6))
+    boards = result.adjustment.T_camera_board()
+    for k, (view, corners) in enumerate(zip(result.adjustment.views, result.corners, strict=True)):
+        T = boards[k]
+        points = board[corners.indices] @ T[:3, :3].T + T[:3, 3]
+        M = place_jacobian(points).reshape(-1, 6)
+        L = _point_by_pose(board[corners.indices], result.adjustment.poses[k])
+        pull = M.T @ L
+        normal += M.T @ M
+        by_parameters += pull @ view.compensation[:, :-1]
+        by_parameters[:, count - result.bends.shape[1] :] += M.T @ np.kron(result.bends[corners.indices], T[:3, 2:3])
+        spread += pull @ np.linalg.solve(view.pose_normal, pull.T)
+    H = np.linalg.inv(normal)
+    return H @ by_parameters, result.variance * H @ spread @ H
+
+
+def _point_by_pose(points: Array, pose: Array) -> Array:
+    """(3M, 6) derivative of R(rvec) p + t by rvec and tvec."""
+    _, dR = cv2.Rodrigues(pose[:3])
+    turns = np.asarray(dR, dtype=np.float64).reshape(3, 3, 3)  # by rvec k, then rows and columns of R
+    by_rvec = np.einsum("kij,mj->mik", turns, points)
+    shift = np.tile(np.eye(3), (len(points), 1, 1))
+    return np.concatenate([by_rvec, shift], axis=2).reshape(-1, 6)
+
+
+MIN_VIEWS_TO_VALIDATE = 4
+_FOLDS = 5
+# Limits for warnings (the reasons are in the messages).
+_VIEWS = 60
+_RMS_PX = 0.5
+_COVERAGE = 0.9
+_TILT_DEG = 30.0
+_HELD_OUT_FACTOR = 1.3
+_INFLATION = 4.0
+_SIMPLE = ("pinhole", "radial2", "opencv4", "opencv5")  # models that a wide lens does not follow
+_WIDE = 0.5  # times as large residuals with the rational model tell a wide lens
+
+
+@dataclass(frozen=True, slots=True)
+class CrossValidation:
+    """Errors of views that were not used in the calibration; only the view's own pose is fitted to it.
+
+    Attributes:
+        folds: number of parts into which the views were split.
+        five_fold_rms_px: over all views, each held out once.
+        five_fold_view_px: (N,).
+        leave_one_out_rms_px: each view judged by a calibration without it (one Newton step).
+        leave_one_out_view_px: (N,); NaN if the other views do not determine the camera.
+    """
+
+    folds: int
+    five_fold_rms_px: float
+    five_fold_view_px: Array
+    leave_one_out_rms_px: float
+    leave_one_out_view_px: Array
+
+
+def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidation:
+    """Five-fold and leave-one-out over the views of a calibration.
+
+    Raises:
+        ComputeError: fewer than four views.
+    """
+    n = len(result.corners)
+    if n < MIN_VIEWS_TO_VALIDATE:
+        raise ComputeError(f"{n} views cannot be cross-validated", remedy="Take more board images")
+    surface = surface_of(result.board)
+    size = (result.camera.width, result.camera.height)
+    folds = min(_FOLDS, n)
+    fold = np.random.default_rng(seed).permutation(n) % folds
+    solution = result.adjustment
+    held_out = np.zeros(n)
+    for k in range(folds):
+        train = np.flatnonzero(fold != k)
+        without = adjust(
+            [result.corners[i] for i in train],
+            surface,
+            size,
+            solution.camera,
+            solution.poses[train],
+            parameters=len(result.parameters),
+            bow_m=solution.bow_m,
+            iterations=6,
+        )
+        points = surface.bent(without.bow_m)
+        for i in np.flatnonzero(fold == k):
+            held_out[i] = fit_pose(result.corners[i], points, without.camera, solution.poses[i])[1]
+    one_out = np.array(
+        [
+            rms(view.residual + view.reduced @ change)
+            for view, change in zip(solution.views, leave_one_out(solution), strict=True)
+        ]
+    )
+    counts = np.array([len(view.indices) for view in result.corners])
+    return CrossValidation(folds, _pooled(held_out, counts), held_out, _pooled(one_out, counts), one_out)
+
+
+def _pooled(per_view_px: Array, counts: Array) -> float:
+    return float(np.sqrt(np.sum(per_view_px**2 * counts) / np.sum(counts)))
+
+
+def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) -> tuple[Array, NDArray[np.int64]]:
+    """Mean residual (rows, columns, 2), px, and number (rows, columns) of the corners in each cell of the image.
+
+    Noise averages out; what remains is the error of the lens model.
+    """
+    corners = np.concatenate([view.corners for view in result.corners])
+    residual = np.concatenate([view.residual.reshape(-1, 2) for view in result.adjustment.views])
+    cells = np.array([columns, rows])
+    size = np.array([result.camera.width, result.camera.height])
+    cell = np.clip((corners + 0.5) / size * cells, 0, cells - 1).astype(int)
+    flat = cell[:, 1] * columns + cell[:, 0]
+    count = np.bincount(flat, minlength=columns * rows)
+    total = np.stack([np.bincount(flat, residual[:, k], columns * rows) for k in (0, 1)], axis=1)
+    mean = total / np.maximum(count, 1)[:, None]
+    return mean.reshape(rows, columns, 2), count.reshape(rows, columns).astype(np.int64)
+
+
+def _wide_lens(result: IntrinsicsResult) -> list[str]:
+    """The warning that a lens is too wide for its model, if the rational one fits the same views far better."""
+    size = (result.camera.width, result.camera.height)
+    try:
+        wide = calibrate_intrinsics(result.corners, result.board, size, model="rational")
+    except ComputeError:  # these views do not determine so many terms
+        return []
+    if wide.rms_px > _WIDE * result.rms_px or len(wide.views) < len(result.views) - 1:
+        return []
+    return [
+        f"a wide lens: the model {result.model} fits to {result.rms_px:.2f} px, rational to {wide.rms_px:.2f} px "
+        f"(fx {wide.camera.fx:.1f} ± {wide.sigma['fx']:.1f}): calibrate with --model rational"
+    ]
+
+
+def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> list[str]:
+    """Warnings that the images do not determine terms of the distortion."""
+    if result.model == "rational":
+        # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
+        if uncertainty.worst_px <= _RMS_PX:
+            return []
+        return [
+            "the quotient of k1 … k6 is not determined in all of the image: show the board in its corners, or use "
+            "fewer terms"
+        ]
+    return [
+        f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"
+        for name, sigma in result.sigma.items()
+        if name in ("k2", "k3") and sigma > abs(getattr(result.camera, name))
+    ]
+
+
+def calibration_warnings(
+    result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
+) -> tuple[str, ...]:
+    """Reasons to trust this calibration less, in words; empty if there are none."""
+    found: list[str] = []
+    n = len(result.views)
+    if n < _VIEWS:
+        found.append(f"{n} views; {_VIEWS} or more average the errors that corners of one image share")
+    if result.rms_px > _RMS_PX:
+        found.append(f"{result.rms_px:.2f} px rms, more than {_RMS_PX} px: blur, motion, bent board, wrong model")
+    if result.coverage < _COVERAGE:
+        share = f"{floor(1000 * result.coverage) / 10:g} %"  # rounded down, so that it never reaches its limit
+        found.append(f"corners in {share} of the image, less than {_COVERAGE:.0%}: show the board there")
+    if result.tilt_deg.max() < _TILT_DEG:
+        found.append(f"largest tilt {result.tilt_deg.max():.0f}°, less than {_TILT_DEG:.0f}°: focal length is weak")
+    if result.inflation > _INFLATION:
+        found.append(
+            f"images disagree {np.sqrt(result.inflation):.1f} times as much as their corners' noise explains "
+            "(light, a bent board or a wrong model); the sigmas are enlarged by this"
+        )
+    if result.model in _SIMPLE and (result.rms_px > _RMS_PX or result.inflation > _INFLATION):
+        found += _wide_lens(result)
+    found += _undetermined(result, uncertainty)
+    bow_m = max(result.board.bow_m, key=abs)
+    if abs(bow_m) > result.board.flatness_m:
+        found.append(
+            f"the board is bent by {mm(abs(bow_m)):.2f} mm, more than its stated flatness of "
+            f"{mm(result.board.flatness_m):g} mm: the camera is corrected for an even bow, not for waves"
+        )
+    if result.board.pattern == "circles":
+        found.append("the middle of a tilted circle's image is not its centre: a checkerboard is more accurate")
+    if validation is None:
+        found.append("too few views for cross-validation")
+    elif validation.five_fold_rms_px > _HELD_OUT_FACTOR * result.rms_px:
+        found.append(
+            f"held-out views err by {validation.five_fold_rms_px:.2f} px, views in the fit by {result.rms_px:.2f} px"
+        )
+    if uncertainty.worst_px > _RMS_PX:
+        found.append(
+            f"projection is uncertain by {uncertainty.worst_px:.2f} px ({uncertainty.worst_mm:.3f} mm at "
+            f"{uncertainty.distance_m:.2f} m) where it is worst in the image"
+        )
+    return tuple(found)

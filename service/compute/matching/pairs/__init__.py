@@ -1,1 +1,0 @@
-"""Pairs of images: correspondences, overlap, difficulty and relative poses from depth and poses."""

@@ -1,1 +1,0 @@
-"""Scores of feature matching: distances of matches from the truth, and errors of the poses that they give."""

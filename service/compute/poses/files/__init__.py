@@ -1,1 +1,0 @@
-"""Files of camera poses and of what goes with them."""

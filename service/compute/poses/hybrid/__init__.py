@@ -1,1 +1,0 @@
-"""Hybrid poses: images, robot and spheres in one bundle adjustment."""

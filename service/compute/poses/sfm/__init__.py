@@ -1,1 +1,0 @@
-"""Structure from motion: features, pairs, tracks, mapping and adjustment."""

@@ -1,1 +1,0 @@
-"""Which outline belongs to which sphere, in one image and over all images."""

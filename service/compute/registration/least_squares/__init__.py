@@ -1,1 +1,0 @@
-"""The registration as a least-squares problem: residuals, start, normal equations, variance components."""

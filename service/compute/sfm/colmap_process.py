@@ -1,0 +1,202 @@
+"""Runs COLMAP and reads its models in child processes, because it takes over signal handlers and may crash."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import resource
+import tempfile
+import time
+import weakref
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from math import ceil
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, cast
+
+import psutil
+
+from service.compute.resources import keep_freed_memory
+from service.compute.sfm.options import Progress
+from service.core.errors import ComputeError, DataError, OrthocaptureError
+from service.core.geometry import Transform
+from service.logs.terminal import show_own_words_only
+
+
+def _child(log: str, seed: int, pipe: Connection) -> None:
+    keep_freed_memory()
+    importlib.import_module("service.compute.sfm.child").main(log, seed, pipe)
+
+
+class ColmapProcess:
+    """Runs tasks one after another in a child process, which starts with the first task and lives until `close`.
+
+    Not thread-safe.
+    """
+
+    def __init__(self, *, seed: int, log: Path | None = None) -> None:
+        """Write COLMAP's output to `log`; None: to a temporary file."""
+        self._seed = seed
+        self._temporary = log is None
+        self._log = log
+        self._process: Any = None
+        self._pipe: Connection | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def run(self, task: str, job: dict[str, Any], *, timeout_s: float, progress: Progress | None = None) -> Any:
+        """Run `task` (see `child`) on the job and return its result.
+
+        Raises:
+            ComputeError: COLMAP failed, crashed or took too long.
+            OrthocaptureError: raised by the task itself.
+        """
+        try:
+            answer = self._answer(task, job, time.monotonic() + timeout_s, progress)
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            tail = self._tail()
+            self.close()
+            raise ComputeError(
+                f"COLMAP crashed during {task}: {tail}", where=str(self._log), remedy="See its log"
+            ) from None
+        except BaseException:
+            self.close()  # otherwise a late answer could be taken for the next task's
+            raise
+        if answer is None:
+            self.close()
+            raise ComputeError(f"COLMAP did not end {task} within {timeout_s:.0f} s", where=str(self._log))
+        kind, value = answer
+        if kind == "result":
+            return value
+        if isinstance(value, OrthocaptureError):
+            raise value
+        raise ComputeError(f"COLMAP failed during {task}: {value}", where=str(self._log), remedy="See its log")
+
+    def _answer(
+        self, task: str, job: dict[str, Any], deadline: float, progress: Progress | None
+    ) -> tuple[str, Any] | None:
+        """The child's answer to the task; None if it took too long."""
+        pipe = self._started()
+        pipe.send((task, job))
+        while pipe.poll(max(0.0, deadline - time.monotonic())):
+            kind, value = pipe.recv()
+            if kind != "progress":
+                return kind, value
+            if progress is not None:
+                progress(*value)
+        return None
+
+    def close(self) -> None:
+        """End the child; the next task starts a new one."""
+        if self._process is None:
+            return
+        assert self._pipe is not None
+        self._pipe.close()
+        self._process.join(timeout=1)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._process.close()
+        self._process = self._pipe = None
+        if self._temporary and self._log is not None:
+            self._log.unlink(missing_ok=True)
+            self._log = None
+
+    def _started(self) -> Connection:
+        if self._pipe is None:
+            if self._log is None:
+                handle, name = tempfile.mkstemp(prefix="orthocapture-colmap-", suffix=".log")
+                os.close(handle)
+                self._log = Path(name)
+                weakref.finalize(self, self._log.unlink, missing_ok=True)  # in case nobody closes it
+            context = multiprocessing.get_context("spawn")
+            self._pipe, theirs = context.Pipe()
+            self._process = context.Process(
+                target=_child, args=(str(self._log), self._seed, theirs), daemon=True, name="colmap"
+            )
+            self._process.start()
+            theirs.close()
+        return self._pipe
+
+    def _tail(self) -> str:
+        assert self._log is not None
+        try:
+            lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        except FileNotFoundError:
+            return "no log"
+        return " | ".join(lines[-3:]) if lines else "empty log"
+
+
+_SPARE_BYTES = 1 << 30  # beyond what the library itself needs
+_SPARE_S, _BYTES_PER_S = 3.0, 1e6  # text is read sixty times as fast
+_PER_BYTE = 40  # memory per byte of a model's files: an observation takes 24 bytes in a file and about 60 in memory
+
+
+def read_model(folder: Path) -> dict[str, Transform]:
+    """T_world_camera (4, 4) by image name from the model in `folder`.
+
+    Raises:
+        DataError: the model cannot be read.
+    """
+    return cast("dict[str, Transform]", _in_child(_read, folder, str(folder)))
+
+
+def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> object:
+    context = multiprocessing.get_context("spawn")
+    try:
+        with ProcessPoolExecutor(1, mp_context=context, initializer=_bound, initargs=(str(folder),)) as pool:
+            outcome = pool.submit(work, *arguments).result()
+    except BrokenProcessPool:
+        outcome = "pycolmap crashed on it, or took far longer than a sound model takes"
+    except MemoryError:
+        outcome = "it announces more than memory can hold"
+    if isinstance(outcome, str):
+        raise DataError(
+            f"the COLMAP model cannot be read: {outcome}",
+            where=str(folder),
+            remedy="Check that cameras, images and points3D belong together and are complete",
+        )
+    return outcome
+
+
+def _bound(folder: str) -> None:
+    """Limit this process's memory and processor time to what an intact model of these files needs.
+
+    Counts in a damaged file may request any amount; beyond the limits, the system ends the process.
+    """
+    show_own_words_only()
+    importlib.import_module("pycolmap")
+    mapped_bytes = psutil.Process().memory_info().vms
+    files_bytes = sum(file.stat().st_size for file in Path(folder).iterdir() if file.is_file())
+    limit = mapped_bytes + _SPARE_BYTES + _PER_BYTE * files_bytes
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
+    limit_s = ceil(time.process_time() + _SPARE_S + files_bytes / _BYTES_PER_S)
+    _, most_s = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(
+        resource.RLIMIT_CPU, (limit_s if most_s == resource.RLIM_INFINITY else min(limit_s, most_s), most_s)
+    )
+
+
+def _read(folder: str) -> dict[str, Transform] | str:
+    colmap = importlib.import_module("pycolmap")
+    convention = importlib.import_module("service.compute.sfm.colmap")
+    colmap.logging.minloglevel = colmap.logging.FATAL.value
+    try:
+        model = colmap.Reconstruction(folder)
+        images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
+        return {image.name: convention.from_colmap_pose(image.cam_from_world()) for image in images}
+    except UnicodeDecodeError:
+        return "the name of an image is not UTF-8"
+    except (RuntimeError, ValueError, IndexError, OSError) as error:  # everything that pycolmap raises
+        return (str(error).strip().splitlines() or [type(error).__name__])[-1]

@@ -1,1 +1,0 @@
-"""Spheres of known radius in meshes and point clouds."""
