@@ -18,7 +18,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
         "service/compute/camera_model.py",
         "service/compute/registration/pose_errors.py",
         "service/compute/registration/result.py",
-        "service/compute/registration/further_cameras/*.py",
+        "service/compute/registration/further_camera.py",
         "service/compute/hybrid/adjustment.py",
         "service/compute/sfm/estimate.py",
         "service/compute/intrinsics/uncertainty.py",
