@@ -118,36 +118,36 @@ soak: $(TOOLS)
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \
 	--python-version 3.11 --group build pyproject.toml
 lock:
-	$(COMPILE) -o constraints.txt
-	$(COMPILE) --extra dev --constraint constraints.txt -o constraints-dev.txt
+	$(COMPILE) -o .ci/constraints.txt
+	$(COMPILE) --extra dev --constraint .ci/constraints.txt -o .ci/constraints-dev.txt
 	echo 'transformers huggingface-hub<2 sympy networkx filelock fsspec jinja2 typing-extensions' | tr ' ' '\n' | \
-		$(subst --group build pyproject.toml,--constraint constraints-dev.txt -,$(COMPILE)) -o constraints-grounded.txt
+		$(subst --group build pyproject.toml,--constraint .ci/constraints-dev.txt -,$(COMPILE)) -o .ci/constraints-grounded.txt
 	sed -i '1i # Locked versions and hashes of what the detector grounded needs beside PyTorch; made by `make lock`.' \
-		constraints-grounded.txt
-	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' constraints.txt
-	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt
+		.ci/constraints-grounded.txt
+	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' .ci/constraints.txt
+	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' .ci/constraints-dev.txt
 
 # Ready-made packages only: nothing is compiled on the way, and what has none for this Python is named at once. PyTorch
 # has a file for newer Pythons alone, which older ones cannot compile.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml .ci/constraints.txt
 	test -x $(BIN)/python || { python="$(PYTHON)"; python="$${python:-$$(.ci/find-python)}" && "$$python" -m venv .venv; }
 	$(BIN)/python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14) and \
 		"orthocapture runs on Python 3.11 to 3.13, not on %d.%d: make clean, then make" % sys.version_info[:2])'
-	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints.txt
+	$(PIP) --no-compile --only-binary :all: --require-hashes -r .ci/constraints.txt
 	$(PIP) --no-deps --no-build-isolation --editable .
 	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/torch/testing/' .venv/lib service drivers simulators
 	touch $(READY)
 
 # jsonpath-rw, which mlcroissant needs, is published as a source archive alone: plain Python, built with our setuptools.
-$(TOOLS): $(READY) constraints-dev.txt
-	$(PIP) --no-compile --only-binary :all: --no-binary jsonpath-rw --no-build-isolation --require-hashes -r constraints-dev.txt
+$(TOOLS): $(READY) .ci/constraints-dev.txt
+	$(PIP) --no-compile --only-binary :all: --no-binary jsonpath-rw --no-build-isolation --require-hashes -r .ci/constraints-dev.txt
 	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/torch/testing/' .venv/lib
 	touch $(TOOLS)
 
 # The packages of the detector `grounded`, for its tests: PyTorch without CUDA where the index has that build. Its hash
 # depends on the build, so it is locked by its version alone.
-$(NETWORKS): $(TOOLS) constraints-grounded.txt
-	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints-grounded.txt
+$(NETWORKS): $(TOOLS) .ci/constraints-grounded.txt
+	$(PIP) --no-compile --only-binary :all: --require-hashes -r .ci/constraints-grounded.txt
 	$(PIP) --no-compile --no-deps "$(TORCH)+cpu" || $(PIP) --no-compile "$(TORCH)"
 	touch $(NETWORKS)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import version as _version
 from typing import Any
 
@@ -29,8 +30,17 @@ def _math(visitor: Any, node: nodes.Element) -> None:
     raise nodes.SkipNode
 
 
+_RESULT = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+bench/results/[^)]+)\)")
+
+
+def _offer_results(_app: Any, _page: str, source: list[str]) -> None:
+    """Turn links to bench/results, which lies outside the site, into downloads; in the repository they are links."""
+    source[0] = _RESULT.sub(r"{download}`\1 <\2>`", source[0])
+
+
 def setup(app: Any) -> None:
-    """Called by Sphinx: registers the renderer of formulas, and Mermaid diagrams, which this site shows as text."""
+    """Register how formulas, results and Mermaid diagrams (which this site shows as text) are rendered."""
+    app.connect("source-read", _offer_results)
     app.add_html_math_renderer("mathml", (_math, None), (_math, None))
     app.add_lexer("mermaid", TextLexer)
 

@@ -14,9 +14,20 @@ from drivers.interfaces import Abandoned
 from service.core.errors import ConfigurationError, DataError, ProtocolError
 from service.core.records.events import Record
 from service.core.records.import_list import ImportList
-from service.core.text.checked_yaml import checked, decoded, problem_of, refuse
-from service.core.text.json_text import parse_json
-from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, YamlProblem, YamlTree, field_name, parse_yaml
+from service.core.text.checked_yaml import (
+    NO_LINES,
+    FieldPath,
+    Plain,
+    YamlProblem,
+    YamlTree,
+    checked,
+    decoded,
+    field_name,
+    parse_yaml,
+    problem_of,
+    refuse,
+)
+from service.core.text.files import parse_json
 from service.core.units import metres
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"

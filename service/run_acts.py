@@ -11,9 +11,8 @@ from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates.release import refuse_release, release_meaning
 from service.core.records.events import Event, ItemTicked, RegionDrawn, RobotSeen, RunReleased
 from service.core.run.actions import needs_leave
-from service.core.run.connections import connected_arms, lost_arms
-from service.core.run.state import RunState
-from service.core.text.reasons import reason_of
+from service.core.run.state import RunState, connected_arms, lost_arms
+from service.core.text.words import reason_of
 from service.dataset.registrations import best_registration
 from service.run_record import RunRecord
 from service.store.signatures.signing import checkpoint

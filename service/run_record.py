@@ -11,13 +11,12 @@ from threading import Lock
 from typing import TYPE_CHECKING, Literal
 
 from service.core.errors import ComputeError, IntegrityError
-from service.core.jobs.keys import arguments_name, job_key
-from service.core.jobs.priorities import lane_of
+from service.core.jobs import arguments_name, job_key
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import ArtefactRef, Event, Payload, RecordedView, RunStarted
 from service.core.run.decide import advance, fold
-from service.core.run.state import JobState, RunState
-from service.core.text.clock_time import time_here
+from service.core.run.state import JobState, RunState, lane_of
+from service.core.text.words import time_here
 from service.jobs.memory_grants import waiting_for_memory
 from service.jobs.words import term
 from service.steps import params_models
@@ -28,7 +27,7 @@ from service.store.runs import RunLease
 from service.store.store import Store
 
 if TYPE_CHECKING:
-    from service.steps.poses.time_left import PendingResult
+    from service.steps.due_jobs import PendingResult
 
 
 def recorded_root(store: Store, run_id: str) -> RunStarted:
@@ -122,7 +121,7 @@ def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
 
 def results_to_come(log: RunRecord) -> list[PendingResult]:
     """The planned registrations that have not arrived yet, with the time left; empty if all have."""
-    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - most job kinds
+    from service.steps.due_jobs import missing_results  # noqa: PLC0415 - most job kinds
 
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1

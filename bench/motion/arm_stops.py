@@ -27,8 +27,7 @@ from bench.machine import RESULTS, commit, machine
 from drivers.interfaces import Abandoned
 from drivers.kuka import KukaConfig
 from drivers.ur import UrConfig
-from service.core.arms.known import known_arms
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, known_arms
 from service.core.arms.motion_limits import motion_problems
 from service.core.protocol.models import Motion
 from simulators.kuka_controller.kinematics import MODELS as LBRS

@@ -15,8 +15,8 @@ from sqlalchemy import update
 
 from bench.motion.clock_world import Duration, Seen, World, above, allows, below
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
+from service.core.records.base import elapsed
 from service.core.records.events import OperatorAction, SessionStarted
-from service.core.records.moments import elapsed
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.figures import read_health
@@ -31,8 +31,8 @@ from service.monitor.snapshot import (
     read_snapshot,
     write_frame,
 )
-from service.steps.capture.held_camera import new_images
 from service.steps.context import StepContext
+from service.steps.held_camera import new_images
 from service.store.database.tables import jobs, leases
 from service.store.disk_space import USUAL_AGE_S, remove_leftovers
 from service.store.durable_effects import moment_of

@@ -22,8 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from service.core.arms.flange import flange_pose, pose_gap
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model, flange_pose, pose_gap
 from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from service.core.jobs.references import Each, Reference, read_reference
+from service.core.jobs import Each, Reference, read_reference
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import (
     Event,

@@ -1,4 +1,7 @@
-"""Screenshots of every page at tablet and desktop size, from a copy of a recorded run, for docs/screens."""
+"""Takes screenshots of every page at tablet and desktop size, from a copy of a recorded run, into build/screens.
+
+Those that a document shows are committed in docs/screens: `--into docs/screens --only 'run-hold|audit$|capture$'`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ from service.store.store import Store
 from tests.support.pages.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people, chromium, screen, served
 from tests.support.runs.attended import attended
 
-FOLDER = REPOSITORY / "docs" / "screens"
+FOLDER = REPOSITORY / "build" / "screens"
 PEOPLE: tuple[tuple[str, Role], ...] = (("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor"))
 LIMIT_BYTES, QUALITY = 90_000, 80
 PENDING_TRIES = 600  # half a second each: a data set's pictures take a while
@@ -89,7 +92,7 @@ TABLET_ONLY = frozenset({"run-hold", "run-working", "viewpoint", "sign-dialog", 
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Take the screenshots into docs/screens and write a list of them."""
+    """Take the screenshots and write a list of them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="data folder with a completed simulated demo run")
     parser.add_argument("--rig", type=Path, required=True, help="its rig file")

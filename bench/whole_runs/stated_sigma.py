@@ -26,7 +26,7 @@ from service.compute.registration.cost import RegistrationSettings
 from service.compute.registration.pose_errors import camera_errors
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, skew
-from service.core.jobs.references import jobs_of
+from service.core.jobs import jobs_of
 from service.core.units import mm
 from service.dataset.summary import RunSummary, summarise
 from service.jobs.registration import register as job

@@ -20,7 +20,7 @@ def protocol_text() -> str:
     return _page(
         "The protocol file",
         "A lab procedure in YAML: the parts of the scene, the motion of the arm, and the steps in their order. "
-        "`orthocapture protocol check protocols/exvivo_spine.yaml` reports every error of a file, by line and "
+        "`orthocapture protocol check exvivo_spine` reports every error of a file, by line and "
         "field; editors can check it with `protocol.schema.json` beside this page. The `params` of a step, and the "
         "measures for its gates, depend on its kind: [Step kinds](steps.md).",
         {"The file": ProtocolFields, "A step": StepFields},

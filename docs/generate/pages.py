@@ -11,8 +11,7 @@ from docs.generate.files import protocol_text, rig_text
 from docs.generate.jobs import jobs_text
 from docs.generate.roles import roles_text
 from docs.generate.steps import steps_text
-from service.core.documents.protocol_docs import lifecycle_text, schema_text
-from service.core.documents.ways_docs import ways_text
+from service.core.documents import lifecycle_text, schema_text, ways_text
 from service.core.protocol.models import Protocol, load_protocol
 from service.steps import params_models
 

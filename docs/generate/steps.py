@@ -9,6 +9,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
+from service.core.gates.measure_names import REGISTRATION_MEASURE_NAMES, measure_name
 from service.core.protocol.models import Protocol, Step
 from service.jobs import job_kinds
 from service.steps import step_kinds
@@ -27,7 +28,7 @@ gates:
 
 A gate compares the measured number with `min` and `max`, in the unit of the measure. Where a measure states its
 uncertainty, both bounds of the number must be within the limits, each held with 99 %; where one is and the other is
-not, the gate is not decided and the step does not pass. `orthocapture protocol check protocols/exvivo_spine.yaml`
+not, the gate is not decided and the step does not pass. `orthocapture protocol check exvivo_spine`
 refuses a measure that a kind does not have, another unit, and limits that cannot be meant (column *limits*).
 
 Params that name an earlier step say in their type what that step must do.
@@ -88,7 +89,9 @@ def measures_of_kind(kind: StepKind[Any]) -> dict[str, Measure]:
 
 
 def _measures(kind: StepKind[Any]) -> Iterator[str]:
-    yield "| measure | unit | limits | meaning |"
-    yield "|---|---|---|---|"
+    yield "| measure | name | unit | limits | meaning |"
+    yield "|---|---|---|---|---|"
     for name, measure in measures_of_kind(kind).items():
-        yield f"| `{name}` | {measure.unit} | {measure.least:g} to {measure.most:g} | {measure.meaning} |"
+        of_one = name.removeprefix("NAME_")
+        shown = measure_name(name) if of_one == name else REGISTRATION_MEASURE_NAMES[of_one]
+        yield f"| `{name}` | {shown} | {measure.unit} | {measure.least:g} to {measure.most:g} | {measure.meaning} |"

@@ -16,10 +16,9 @@ from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, OperatorAction
 from service.core.run.actions import VERBS, capture_refusal, record_to_sign, refuse
-from service.core.run.connections import connected_arms, lost_arms
 from service.core.run.fold import fold
-from service.core.run.state import RunState
-from service.core.text.reasons import reason_of
+from service.core.run.state import RunState, connected_arms, lost_arms
+from service.core.text.words import reason_of
 from service.jobs.words import term
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts, who_pauses

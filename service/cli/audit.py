@@ -35,8 +35,8 @@ from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.cli.terminal_output import listed, styled
 from service.core.errors import IntegrityError
 from service.core.gates.release import release_meaning
-from service.core.text.counts import counted
 from service.core.text.person_names import cleaned_name
+from service.core.text.words import counted
 from service.core.units import megabytes
 from service.people.authorisation import Identity
 from service.people.person import ROLES, NotAllowedError, Permission, may

@@ -26,7 +26,7 @@ from service.cli.common import (
 )
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.store.database.engine import database_path
 from service.store.runs import resolve_run
 from service.store.store import Store

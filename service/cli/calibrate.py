@@ -55,13 +55,11 @@ from service.compute.poses.robot_files import (
     read_joints_csv,
     read_robot_poses,
 )
-from service.core.arms.known import arm_model
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, arm_model
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
-from service.core.text.counts import counted
-from service.core.text.file_text import file_text
-from service.core.text.json_text import parse_json
+from service.core.text.files import file_text, parse_json
+from service.core.text.words import counted
 from service.core.units import LengthUnit, mm
 from service.jobs.calibration.records import BoardSeen, HandEye
 from service.jobs.kind import JobRecord

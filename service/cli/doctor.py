@@ -29,8 +29,8 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run import RigOption
-from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
-from service.core.equipment.disk_space import Forecast, Usage, forecast
+from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
+from service.core.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import HostClock
@@ -43,6 +43,7 @@ from service.steps import params_models
 from service.store.database.engine import database_path
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import Clock, DurableFiles, SystemClock
+from service.store.mounts import why_unsafe
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
@@ -79,15 +80,16 @@ def doctor_command(
             record_devices(station, record, SystemClock(), quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
         free_bytes = shutil.disk_usage(existing).free
+        unsafe = why_unsafe(existing)
         place = _second_place(rig_file, data)
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
-    healthy = healthy and (space is None or space.verdict == "enough") and not place.get("problem")
+    healthy = healthy and not unsafe and (space is None or space.verdict == "enough") and not place.get("problem")
     clock = host_clock()
     missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
     if json:
         devices = {name: _record(report) for name, report in found.items()}
-        folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes}
+        folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes, "unsafe": unsafe or None}
         if space is not None:
             folder["forecast"] = dataclasses.asdict(space) | {"verdict": space.verdict, "words": space.words}
         found_clock = clock.model_dump()
@@ -107,6 +109,8 @@ def doctor_command(
         for name, report in found.items():
             _print(name, report)
         _print_machine(data, free_bytes, space, clock)
+        if unsafe:
+            console.tell(("!", "bold red"), f" the data folder is {unsafe} (docs/howto/operating.md, One server)")
         if place:
             console.print(
                 f"second place of the signatures {place['path']}: {place['problem'] or 'up to date'}", markup=False

@@ -23,7 +23,7 @@ from service.cli.common import (
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.store.store import Store
 
 

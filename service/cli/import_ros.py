@@ -36,7 +36,7 @@ from service.compute.poses.ros_recording import (
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Transform
 from service.core.picture_files import kind_of
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import ms, nanoseconds, seconds_of_ms, seconds_of_ns
 
 _SUFFIXES = {"JPEG": ".jpg", "PNG": ".png"}

@@ -40,7 +40,7 @@ from service.compute.intrinsics.uncertainty import (
     projection_uncertainty,
 )
 from service.core.errors import ComputeError, ConfigurationError, DataError
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import metres, mm
 from service.jobs.calibration.records import Intrinsics
 from service.worker.calibration.records import intrinsics_record

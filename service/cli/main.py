@@ -147,6 +147,19 @@ _COMMANDS = {
     "protocol": _Command("service.cli.protocol:protocol_app", "Check a protocol file before it is used."),
     "plan": _Command("service.cli.plan:plan_app", "Plan viewpoints, before and during a capture."),
 }
+# Under which heading the help lists each command; the order is that of the help.
+_GROUPS = {
+    "Capture": (
+        "demo", "run", "resume", "import", "status", "act", "note", "plan", "protocol", "draw-region", "cancel",
+    ),
+    "Evidence and data sets": ("runs", "compare", "history", "audit", "replay", "export"),
+    "Calibration and computing": (
+        "calibrate", "sfm", "register", "spheres", "layout", "fuse", "develop", "import-ros", "evaluate", "worker",
+    ),
+    "Site": ("serve", "doctor", "accounts", "store", "dicom-listen"),
+    "Development": ("simulate", "benchmark"),
+}  # fmt: skip
+_GROUP_OF = {name: group for group, names in _GROUPS.items() for name in names}
 _SETTINGS: dict[str, dict[str, Any]] = {
     "simulate": {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 }
@@ -178,14 +191,16 @@ class _Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names in the order of the help text."""
-        return list(_COMMANDS)
+        return list(_GROUP_OF)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The name and the line of a command, for help and shell completion; None if there is no such command.
 
         Importing every command would take seconds. The one that was typed comes from `resolve_command`.
         """
-        return TyperCommand(cmd_name, help=_COMMANDS[cmd_name].line) if cmd_name in _COMMANDS else None
+        if cmd_name not in _COMMANDS:
+            return None
+        return TyperCommand(cmd_name, help=_COMMANDS[cmd_name].line, rich_help_panel=_GROUP_OF[cmd_name])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that was typed, imported; suggests a similar name if there is no such command."""
@@ -226,8 +241,18 @@ def orthocapture(
     _version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", callback=_tell_version, is_eager=True)
     ] = False,
+    allow_mount: Annotated[
+        bool,
+        typer.Option(
+            "--allow-mount", help="Write into a data folder on any file system, also one that other machines mount."
+        ),
+    ] = False,
 ) -> None:
     """Acquire surgical vision data sets that are accurate to a fraction of a millimetre, with proof of origin."""
+    if allow_mount:
+        from service.store.mounts import ALLOW  # noqa: PLC0415 - seldom needed
+
+        os.environ[ALLOW] = "1"  # for the processes, too, that a command starts
 
 
 def main() -> None:

@@ -15,17 +15,16 @@ from typing import TYPE_CHECKING, Any
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
 from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError
 from service.core.gates.acceptance import demanded_role
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import Protocol, Step
+from service.core.protocol.models import Protocol, Step, irreversible_warning
 from service.core.records.events import OperatorAction
 from service.core.records.import_list import FileRole, ImportList, PhotographRole
-from service.core.recovery.ways_on import takes_words
+from service.core.recovery import takes_words
 from service.core.run.decide import AskOperator
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.core.shown_text import shown
-from service.core.text.json_text import parse_json
-from service.core.text.reasons import reason_of
+from service.core.text.files import parse_json
+from service.core.text.words import reason_of
 from service.jobs.words import term
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
@@ -33,7 +32,7 @@ from service.people.authorisation import Identity, identity_for
 from service.people.person import PeopleError
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
-from service.steps.kinds.imports import ct_import, image_import, scan_import
+from service.steps.kinds import ct_import, image_import, scan_import
 
 if TYPE_CHECKING:
     from service.cli.terminal_output import Progress

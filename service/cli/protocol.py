@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from service.cli.common import JsonOption, console, print_document, print_json, protocol_file, reporting_errors
-from service.core.documents.protocol_docs import lifecycle_text, schema_text
-from service.core.documents.ways_docs import ways_text
+from service.core.documents import lifecycle_text, schema_text, ways_text
 from service.core.protocol.models import load_protocol
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.rig import load_rig
 from service.station import devices_of
 from service.steps import params_models

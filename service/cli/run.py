@@ -73,7 +73,7 @@ from service.run_start import (
 from service.runner.loop import Runner
 from service.station import Station, devices_of, layout_of
 from service.steps import params_models
-from service.steps.poses.time_left import duration_words
+from service.steps.due_jobs import duration_words
 from service.store.access import kept_to
 from service.store.signatures.second_place import away_words
 from service.store.signatures.timestamps import stamp_end
@@ -385,7 +385,7 @@ def open_devices(station: Station) -> OpenDevices:
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
     """What a capture step will do, in words, for the person who is asked to confirm it."""
     # Planning takes half a second to load, which a run that is answered on the screen does without.
-    from service.steps.capture.plan.preview import preview_board_poses, preview_plans  # noqa: PLC0415
+    from service.steps.plan_preview import preview_board_poses, preview_plans  # noqa: PLC0415
 
     try:
         plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))

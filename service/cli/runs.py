@@ -25,7 +25,8 @@ from service.cli.common import (
     require_writable,
     write_whole,
 )
-from service.core.text.counts import counted
+from service.core.gates.measure_names import measure_name
+from service.core.text.words import counted
 from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
@@ -127,7 +128,8 @@ def compare_command(
         for heading in ("", one, other, "change"):
             table.add_column(heading)
         for row in rows:
-            name = " ".join(filter(None, (row.step, row.name))).replace("_", " ")
+            named = measure_name(row.name) if part in ("gates", "measures") else row.name.replace("_", " ")
+            name = " ".join(filter(None, (row.step, named)))
             table.add_row(name, row.first, row.second, row.change)
         print_table(table)
     for run_id, lines in zip((one, other), comparison.deviations, strict=True):

@@ -31,8 +31,8 @@ from service.cli.common import (
     shipped_protocols,
 )
 from service.core.errors import ConfigurationError, StoreError
-from service.core.text.clock_time import local_time
 from service.core.text.person_names import cleaned_name
+from service.core.text.words import local_time
 from service.logs.file_log import file_log
 from service.people.sessions import People
 from service.rig import load_rig
@@ -214,7 +214,7 @@ def _served_already(path: Path, said: bytes) -> ConfigurationError:
 def _load_the_rest() -> None:
     """Load what pages need to be shown but not to be listed: a server is ready earlier, and no page waits for it."""
     list(params_models())
-    for late in ("service.steps.poses.time_left", "service.store.signatures.timestamps"):
+    for late in ("service.steps.due_jobs", "service.store.signatures.timestamps"):
         importlib.import_module(late)
 
 

@@ -33,7 +33,7 @@ from service.compute.surfaces.mesh_spheres import (
 )
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import metres, mm
 from service.worker.surfaces.records import measured_sphere
 

@@ -21,16 +21,15 @@ from service.cli.terminal_output import listed
 from service.core.gates.verdict import Standing, describe, standing
 from service.core.records.entered import about_rows
 from service.core.records.events import GateVerdict
-from service.core.recovery.ways_on import takes_words, ways_on
-from service.core.run.connections import lost_arms
-from service.core.run.state import RunState, StepState
-from service.core.run.tries import tries_words
-from service.core.text.clock_time import time_utc
+from service.core.recovery import takes_words, ways_on
+from service.core.run.expected import tries_words
+from service.core.run.state import RunState, StepState, lost_arms
+from service.core.text.words import time_utc
 from service.jobs.capture import live_summary, live_view
 from service.run_record import open_jobs, read_log, results_to_come
 from service.run_start import recorded_run
-from service.steps.capture.live_numbers import describe_view
 from service.steps.coats import coats
+from service.steps.live_numbers import describe_view
 from service.store.durable_effects import moment_of
 from service.store.store import Store
 

@@ -19,7 +19,7 @@ from service.cli.common import (
     require_writable_folder,
 )
 from service.cli.options import OperatorOption, PasswordOption, acting_person
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import gigabytes
 from service.store.backup.backup import BackupOptions, BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore

@@ -17,7 +17,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.logs.file_log import file_log
 from service.store.access import kept_to
 from service.worker.pool import work_side_by_side

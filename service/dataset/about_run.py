@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.core.equipment.camera_bodies import bodies
-from service.core.equipment.recorded_devices import recorded_optics, recorded_report
-from service.core.gates.dependence import accepted_gates
+from service.core.gates.acceptance import accepted_gates
 from service.core.gates.verdict import BOUNDS_HOLD, describe, standing
+from service.core.recorded_devices import bodies, recorded_optics, recorded_report
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.records.events import DeviceOpened
 from service.core.records.import_list import imported_sentence

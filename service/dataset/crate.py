@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from service.core.records.attribution import Party, licence_name
+from service.core.records.data_set import Party, licence_name
 from service.dataset.export_folder import ListedFile
 from service.dataset.records import About, DataSet
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.core.records.attribution import Party
+from service.core.records.data_set import Party
 from service.dataset.crate import media_type
 from service.dataset.export_folder import ListedFile
 from service.dataset.records import DataSet, PosedView

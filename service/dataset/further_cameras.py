@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from service.core.equipment.camera_clocks import ClockOffset, clock_offset
-from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
+from service.core.clocks import ClockOffset, clock_offset
 from service.core.geometry import Transform
 from service.core.protocol.models import Protocol
+from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import ArtefactRef, FurtherExposure, RecordedView, ViewpointCaptured
 from service.core.run.state import RunState
 from service.core.units import mm, mrad

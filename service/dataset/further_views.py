@@ -12,7 +12,7 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
 from service.compute.registration.pose_errors import product_jacobians
-from service.core.equipment.camera_clocks import clock_offset
+from service.core.clocks import clock_offset
 from service.core.geometry import Array, Transform
 from service.core.records.events import ViewpointCaptured
 from service.core.units import mm, mrad

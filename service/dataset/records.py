@@ -16,8 +16,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
-from service.core.records.attribution import Party, doi_address, licence_address, party
-from service.core.records.data_set import FIRST_VERSION, DataSetStatement
+from service.core.records.data_set import FIRST_VERSION, DataSetStatement, Party, doi_address, licence_address, party
 from service.jobs.registration.evaluate import ErrorBudget, Row
 
 NOT_STATED = "not stated"

@@ -15,11 +15,10 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from service.core.errors import IntegrityError
-from service.core.jobs.priorities import lane_of
+from service.core.gates.release import late_words
 from service.core.protocol.models import Protocol
 from service.core.protocol.step_params import Gives
-from service.core.results.arrival import late_words
-from service.core.run.state import JobState, RunState
+from service.core.run.state import JobState, RunState, lane_of
 from service.jobs.kind import JobRecord
 from service.jobs.poses import structure_from_motion
 from service.jobs.registration import evaluate, further_camera, register

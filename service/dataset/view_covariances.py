@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, skew
-from service.core.jobs.references import jobs_of
+from service.core.jobs import jobs_of
 from service.core.run.state import JobState
 from service.core.units import mm, mrad
 from service.dataset.summary import RunSummary

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from service.core.errors import IntegrityError
-from service.core.jobs.references import Jobs, resolve
+from service.core.jobs import Jobs, resolve
 
 
 class JobRecord(BaseModel):

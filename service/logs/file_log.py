@@ -18,7 +18,7 @@ from os import getpid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from service.core.equipment.disk_space import LEAST_FREE_BYTES
+from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.units import gigabytes
 
 if TYPE_CHECKING:

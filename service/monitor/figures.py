@@ -14,11 +14,11 @@ from pathlib import Path
 from pydantic import BaseModel
 from sqlalchemy import Connection, case, func, select, text
 
-from service.core.equipment.disk_space import LEAST_FREE_BYTES
+from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import OrthocaptureError
-from service.core.jobs.priorities import EARLY
 from service.core.records.events import RunStarted
 from service.core.run.expected import EarlierTimes
+from service.core.run.state import EARLY
 from service.core.units import gigabytes
 from service.monitor.snapshot import Doing, RobotPhase, living_workers, read_snapshot
 from service.store.database.tables import event_index, events, jobs, runs

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol
 from service.core.records.events import Event, Identified, ProtocolApproved
-from service.core.text.reasons import reason_of
+from service.core.text.words import reason_of
 from service.store.database.tables import event_index, events
 from service.store.events import to_event
 from service.store.records import SITE

@@ -10,9 +10,9 @@ from typing import Any, Literal
 from sqlalchemy import Connection, Row, select
 from sqlalchemy.dialects.sqlite import insert
 
+from service.core.records.base import age_s
 from service.core.records.events import ControlTaken
-from service.core.records.moments import age_s
-from service.core.text.reasons import reason_of
+from service.core.text.words import reason_of
 from service.people.person import AccountError, ControlError, NotAllowedError, Person
 from service.people.rows import SESSION_S
 from service.store.database.tables import accounts, control, runs, sessions

@@ -11,8 +11,8 @@ from typing import Any, Literal
 from argon2 import PasswordHasher
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
+from service.core.records.base import age_s
 from service.core.records.events import AccountChanged, SignInRecorded
-from service.core.records.moments import age_s
 from service.people.accounts import Accounts, Badges
 from service.people.credentials import Passwords, Pepper, ShortSecrets, new_token, token_sha256
 from service.people.person import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from service.core.equipment.clocks import clock_readings
+from service.core.clocks import clock_readings
 from service.run_record import RunFollower
 
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from service.core.equipment.disk_space import Forecast, Verdict
+from service.core.disk_space import Forecast, Verdict
 from service.core.protocol.models import Protocol
 from service.core.records.events import StepNote
 from service.runner.held_run import HeldRun

@@ -16,9 +16,9 @@ from service.core.errors import OrthocaptureError, UnforeseenError
 from service.core.protocol.models import Protocol, Step
 from service.core.records.base import recorded
 from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured, StepNote
-from service.core.recovery.policy import TRIED_AGAIN, recovery_policy
+from service.core.recovery import TRIED_AGAIN, recovery_policy
 from service.core.run.state import JobState
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.logs.file_log import at
 from service.monitor.snapshot import living_workers
 from service.run_record import StepEvidence

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from drivers.errors import LeaveNeededError
 from service.core.protocol.models import Protocol
+from service.core.records.base import Moment, elapsed
 from service.core.records.events import LeaveLapsed
-from service.core.records.moments import Moment, elapsed
+from service.core.run.expected import failed_words
 from service.core.run.state import Leave, RunState
-from service.core.run.tries import failed_words
 from service.monitor.host import processor_s
 from service.monitor.snapshot import living_workers
 from service.runner.held_run import HeldRun

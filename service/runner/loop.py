@@ -10,11 +10,10 @@ from os import getpid
 
 from drivers.errors import DeviceChangedError
 from drivers.interfaces import DeviceReport, PedalReading
-from service.core.equipment.exchanged import CHANGED, NOT_CALIBRATED, exchanged, exchanged_words
-from service.core.equipment.recorded_devices import recorded_report
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe_judged
 from service.core.protocol.models import Protocol
+from service.core.recorded_devices import CHANGED, NOT_CALIBRATED, exchanged, exchanged_words, recorded_report
 from service.core.records.events import (
     ActionRefused,
     DeviceOpened,
@@ -39,9 +38,9 @@ from service.core.run.decide import (
     decide,
     evaluate_gates,
 )
+from service.core.run.expected import tries_words
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
-from service.core.run.tries import tries_words
 from service.monitor.host import host_clock
 from service.runner.clocks import ClockWatch
 from service.runner.disk import DiskWatch

@@ -14,7 +14,8 @@ from drivers.errors import DeviceTimeoutError
 from drivers.interfaces import CtSource, DeviceReport, ScannedMesh
 from drivers.meshes.foreign_text import name_of
 from drivers.meshes.polygons import in_doubt
-from service.core.records.events import ArtefactRef, FilesKept
+from service.core.records.events import ArtefactRef, FilesKept, Uncertainty
+from service.jobs.records import JudgedLayout
 from service.steps.context import StepContext
 from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact
@@ -177,3 +178,8 @@ def _record(context: StepContext, ref: ArtefactRef, device: str, note: str) -> N
     )
     payload = FilesKept(step=context.step.id, attempt=context.attempt, device=device, note=note, artefacts=(ref,))
     context.evidence.record(payload, artefacts=(row,))
+
+
+def layout_uncertainties(layout: JudgedLayout | None) -> dict[str, Uncertainty]:
+    """The uncertainty of each measure of a layout; empty where it was not judged (None)."""
+    return {} if layout is None else dict(layout.bounds)

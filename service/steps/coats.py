@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from service.core.protocol.models import Protocol, Step
-from service.core.records.moments import Elapsed, Moment, elapsed
+from service.core.records.base import Elapsed, Moment, elapsed
 from service.core.run.state import RunState
-from service.steps.kinds.by_hand import timed_application
-from service.steps.kinds.imports import scan_import
+from service.steps.kinds import scan_import, timed_application
 
 _SHOWN_S = 60.0  # the time left is told in whole minutes
 _CLOSE_S, _SHOWN_CLOSE_S = 300.0, 10.0  # and in steps of ten seconds when there is little of it

@@ -20,16 +20,15 @@ from drivers.interfaces import (
     Transform,
 )
 from service.core.errors import OrthocaptureError
-from service.core.jobs.priorities import WAITED
-from service.core.jobs.references import Each, Reference
+from service.core.jobs import Each, Reference
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
 from service.core.protocol.step_params import StepParams
+from service.core.records.base import Moment
 from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record, RecordedView, StepNote, Uncertainty
 from service.core.records.import_list import ImportList
-from service.core.records.moments import Moment
 from service.core.run.decide import RunState, StepState
-from service.core.run.state import JobState
+from service.core.run.state import WAITED, JobState
 from service.jobs.kind import JobKind, JobRecord
 from service.rig import CollisionSection, FurtherCameraSection, LensSection, ObstacleSection, OpticsSection
 from service.steps.measures import MeasureRecord
@@ -185,7 +184,7 @@ class JobRequest:
             references: field of the arguments (`camera`, `registrations/colmap`, `further_arms/0/arm_correction`) →
                 the reference that is recorded instead of its value; None where no job computed the value, which is
                 then recorded itself.
-            priority: see service.core.jobs.priorities.
+            priority: see service.core.run.state.
         """
         recorded = arguments.plain()
         for path, reference in references.items():

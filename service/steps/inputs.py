@@ -9,11 +9,10 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from service.core.errors import ConfigurationError, IntegrityError
-from service.core.jobs.references import Each, Reference
+from service.core.jobs import Each, Reference, answered_by
 from service.core.records.events import ArtefactRef, RecordedView, ViewHeld, ViewpointCaptured
-from service.core.run.computed import answered_by
 from service.core.run.state import JobState
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord

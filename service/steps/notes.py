@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.core.run.state import StepState
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.jobs.capture.live_summary import Suggestion
 from service.jobs.records import Matrix
 

@@ -10,17 +10,16 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 
-from service.core.arms.known import arm_model, known_arms
+from service.core.arms.model import arm_model, known_arms
 from service.core.arms.motion_limits import motion_problems
 from service.core.errors import ConfigurationError, ProtocolError
 from service.core.protocol.models import Gate, LoadedProtocol, Protocol, Step
 from service.core.protocol.step_params import named_steps
-from service.core.text.checked_yaml import refuse
-from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
+from service.core.text.checked_yaml import FieldPath, Plain, YamlProblem, field_name, parse_yaml, refuse
 from service.rig import Rig, RigDevice, RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
-from service.steps.poses.sources import WantedRegistrations, needing_mount
+from service.steps.registration_sources import WantedRegistrations, needing_mount
 
 # Section and field of the file → its credible range, and its unit.
 _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {

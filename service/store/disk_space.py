@@ -12,7 +12,7 @@ from typing import Literal
 import psutil
 from sqlalchemy import Connection, func, select, text
 
-from service.core.equipment.disk_space import LEAST_FREE_BYTES, Forecast, Usage, forecast, size_words
+from service.core.disk_space import LEAST_FREE_BYTES, Forecast, Usage, forecast, size_words
 from service.core.errors import SpaceShortError, StoreError
 from service.core.protocol.models import Protocol
 from service.core.records.events import LeftoversRemoved

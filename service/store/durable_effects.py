@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Protocol
 
-from service.core.records.moments import Moment
+from service.core.records.base import Moment
 from service.store.access import file_mode, folder_mode, make_folder, open_new
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")

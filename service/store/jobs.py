@@ -9,8 +9,8 @@ from typing import Any, cast
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
 
 from service.core.errors import IllegalTransitionError
-from service.core.jobs.priorities import EARLY, Lane
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
+from service.core.run.state import EARLY, Lane
 from service.core.shown_text import storable
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.core.errors import StoreError
-from service.core.jobs.priorities import WAITED
 from service.core.records.events import ArtefactRef
+from service.core.run.state import WAITED
 
 
 class UnknownRunError(StoreError):

@@ -13,8 +13,8 @@ from typing import Any, Self
 from sqlalchemy import Connection, bindparam, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.core.run.state import Lane
 from service.core.shown_text import storable
 from service.store import jobs as queue
 from service.store.access import close_to_others, require_access
@@ -31,6 +31,7 @@ from service.store.database.engine import (
 from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Ages, Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.events import append, read_events, to_event
+from service.store.mounts import require_own_mount
 from service.store.records import (
     SITE,
     Artefact,
@@ -114,6 +115,7 @@ class Store:
                 remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
             )
         folder = open_folder(data_dir, files, ids)
+        require_own_mount(data_dir)
         close_to_others(data_dir, DATABASE_NAME)
         database = open_database(data_dir, files, patience_s)
         log = SignatureLog(data_dir, files, patience_s)

@@ -8,12 +8,12 @@ from functools import partial, reduce
 from typing import Any
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.jobs.references import jobs_of, references_in, resolve
+from service.core.gates.release import late_s
+from service.core.jobs import jobs_of, references_in, resolve
 from service.core.records.events import Event
-from service.core.results.arrival import late_s
 from service.core.run.fold import advance
 from service.run_record import RunFollower, recorded_protocol, recorded_root
-from service.steps.poses.due_jobs import due
+from service.steps.due_jobs import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -15,9 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from service.core.equipment.disk_space import LEAST_FREE_BYTES
+from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
-from service.core.jobs.priorities import Lane
+from service.core.run.state import Lane
 from service.jobs import job_kinds
 from service.jobs.kind import Demand
 from service.jobs.memory_grants import MemoryGrants

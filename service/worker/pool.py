@@ -22,7 +22,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from service.compute.resources import compute_in_background, keep_freed_memory
-from service.core.jobs.priorities import Lane
+from service.core.run.state import Lane
 from service.logs.file_log import file_log
 from service.logs.terminal import show_own_words_only
 from service.monitor.snapshot import SignOfLife

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import subprocess
 import sys
 import threading
@@ -212,8 +213,21 @@ class _Rig:
             scan_folder=str(self.folder / "scans"),
             not_served=[*self.replay.not_served, *self._left_out()],
         )
+        if sys.stdout.isatty():
+            sys.stderr.write(self._next_commands())
         threading.Thread(target=self._watch, daemon=True).start()
         self._exports.prepare_after("start")
+
+    def _next_commands(self) -> str:
+        """Return what a person at a terminal types next; a program that reads the ready line is told nothing."""
+        rig = shlex.quote(str(self.args.dir / "rig.yaml"))
+        protocol = "handheld_spine" if self.args.hand else "demo" if self.args.arm == "UR10e" else "exvivo_spine"
+        return (
+            "The rig is ready, and stays so until Ctrl-C. Next, in another terminal, in the browser:\n"
+            f"  orthocapture serve --rig {rig} --data runs\n"
+            "or in the terminal:\n"
+            f'  orthocapture run {protocol} --rig {rig} --data runs --operator "A. Name" --specimen "Spine 7"\n'
+        )
 
     def _left_out(self) -> Iterator[str]:
         """What the simulators that serve a recording answer by themselves."""

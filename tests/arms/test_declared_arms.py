@@ -20,21 +20,19 @@ from service.compute.planning.motion_plan import (
     best_posture,
     plan_motion,
 )
-from service.core.arms.flange import flange_pose
-from service.core.arms.known import arm_model, known_arms
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, arm_model, flange_pose, known_arms
+from service.core.arms.seven_axes import elbow_angle_rad
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, inverse, to_rotation_vector, transform
 from service.core.protocol.models import Motion, load_protocol
-from service.core.seven_axes import elbow_angle_rad
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.plan.planning import ArmAtStation, usual_posture
-from service.steps.capture.plan.preview import preview_plans
-from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds.captures import viewpoint_capture
+from service.steps.kinds import viewpoint_capture
+from service.steps.plan_preview import preview_plans
+from service.steps.planning import ArmAtStation, usual_posture
+from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 from simulators.scene.world import Scene
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from service.audit.overview.devices import clock_offsets
 from service.cli.main import app
 from service.core.records.events import FilesKept, SessionStarted, StepStarted
-from service.core.text.clock_time import local_time
+from service.core.text.words import local_time
 from service.store.records import NewArtefact
 from service.store.store import Store
 from tests.support.pages.browsed_run import words

@@ -104,7 +104,7 @@ def test_deviations_come_before_everything_else(report: Report) -> None:
     html = words_of(render_html(report))
     section = html[html.index(" 1 Deviations") : html.index(" 2 Registration error")]
     for text in (
-        "attempt 1: viewpoints_captured 1 view, allowed ≥ 2",
+        "attempt 1: Viewpoints captured 1 view, allowed ≥ 2",
         "v002 given up: no file arrived",
         "the cable was loose",
         "camera: the camera does not answer",
@@ -148,7 +148,7 @@ def test_outside_its_limit_it_says_so(tmp_path: Path) -> None:
     assert "OUTSIDE the limit" in report.result.text
     assert report.result.tone == "stop"
     html = words_of(render_html(report))
-    assert "best_mean_radial_error_mm 0.41 mm, allowed ≤ 0.35" in html
+    assert "Mean radial error of the registration used 0.41 mm, allowed ≤ 0.35" in html
     assert "the step is recovering" in html
 
 

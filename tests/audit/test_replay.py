@@ -18,7 +18,7 @@ from service.audit.replay.differences import compare_data, compare_files
 from service.audit.replay.replay import ReplayReport, replay
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
-from service.core.jobs.references import Reference, jobs_of, references_in, resolve
+from service.core.jobs import Reference, jobs_of, references_in, resolve
 from service.core.records.events import ArtefactRef
 from service.jobs import job_kinds
 from service.jobs.records import SpheresFound

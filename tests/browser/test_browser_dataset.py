@@ -15,6 +15,7 @@ from tests.support.pages.browser import (
     Screen,
     accessibility_faults,
     add_people,
+    follow,
     screen,
     scripts_held_back,
     served,
@@ -96,15 +97,15 @@ def test_photograph_and_depth_cover_each_other(tablet: Screen) -> None:
 @pytest.mark.slow
 def test_another_view_and_another_split_are_chosen(tablet: Screen) -> None:
     page = tablet.page
-    page.locator(".splits").get_by_role("link", name="Sparse").click()
+    follow(page.locator(".splits").get_by_role("link", name="Sparse"))
     expect(page.locator(".splits [aria-current]")).to_contain_text("Sparse")
     names = page.locator(".view-name").all_inner_texts()
     page.locator("select[name=view]").select_option(names[-1])
     expect(page.get_by_alt_text(f"Photograph of view {names[-1]}")).to_be_visible()
     expect(page.locator(".splits [aria-current]")).to_contain_text("Sparse")
-    page.get_by_role("link", name="Previous view").click()
+    follow(page.get_by_role("link", name="Previous view"))
     expect(page.get_by_alt_text(f"Photograph of view {names[-2]}")).to_be_visible()
-    page.locator(".view-link").first.click()
+    follow(page.locator(".view-link").first)
     expect(page.get_by_alt_text(f"Photograph of view {names[0]}")).to_be_visible()
     with scripts_held_back(page) as come:
         page.reload(wait_until="commit")
@@ -116,7 +117,7 @@ def test_another_view_and_another_split_are_chosen(tablet: Screen) -> None:
 @pytest.mark.slow
 def test_a_format_is_exported_with_its_progress_shown(tablet: Screen) -> None:
     page = tablet.page
-    page.get_by_role("link", name="Export…").click()
+    follow(page.get_by_role("link", name="Export…"))
     page.get_by_label("Format").select_option("nerfstudio", timeout=60_000)
     page.get_by_role("button", name="Export in this format").click()
     expect(page.get_by_text("exports since").or_(page.get_by_text("Ready:"))).to_be_visible()

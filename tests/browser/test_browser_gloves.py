@@ -18,7 +18,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.pages.at_the_table import STANDING, at_the_table, left_at, record
-from tests.support.pages.browser import TABLET, Screen, Served, screen, served
+from tests.support.pages.browser import TABLET, Screen, Served, follow, screen, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
 from tests.support.recorded.calibrated_run import RIG
@@ -110,7 +110,7 @@ def test_viewpoints_closer_than_a_fingertip_are_chosen_from_a_list(server: Serve
         assert names[0] == "v027", "the nearest first"
         assert {"v026", "v028"} <= set(names)
         assert all(box(link)["height"] >= 48 for link in choice.locator("a").all())
-        choice.get_by_role("link", name="v028").click()
+        follow(choice.get_by_role("link", name="v028"))
         expect(page).to_have_url(re.compile("viewpoint=v028"))
         expect(page.get_by_role("heading", name="v028")).to_be_visible()
 

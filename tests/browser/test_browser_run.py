@@ -24,6 +24,7 @@ from tests.support.pages.browser import (
     Screen,
     Served,
     accessibility_faults,
+    follow,
     invite_people,
     screen,
     served,
@@ -168,7 +169,7 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
 
         # A viewpoint is retaken, with a reason; the earlier image stays in the record.
         tablet.go(f"/runs/{run}/capture")
-        page.locator("#sheet, .sheet, main").last.get_by_role("link", name=re.compile("v1_001")).last.click()
+        follow(page.locator("#sheet, .sheet, main").last.get_by_role("link", name=re.compile("v1_001")).last)
         page.get_by_text("Redo v1_001…").click()
         page.get_by_label("Reason").first.fill("a hand was in the picture")
         redo = page.get_by_role("button", name="Redo v1_001")

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, FloatRect, Page, expect
 
 from service.core.records.events import OperatorAction, StepFailed, StepStarted
 from tests.support.pages.at_the_table import at_the_table, record
-from tests.support.pages.browser import Served, screen, served
+from tests.support.pages.browser import Served, follow, screen, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
 
@@ -70,7 +70,7 @@ def test_end_run_stays_where_it_is(server: Served, browser: Browser) -> None:
             page.get_by_text("Nothing moves until you press Resume").or_(page.get_by_text("Pausing").first)
         ).to_be_visible()
         places["paused"] = box(page, ".end-run")
-        page.get_by_role("link", name="Fix the specimen").click()
+        follow(page.get_by_role("link", name="Fix the specimen"))
         expect(page.get_by_text("You are looking at a step that is not the current one")).to_be_visible()
         places["looking back"] = box(page, ".end-run")
         assert len({tuple(place.values()) for place in places.values()}) == 1, places
@@ -104,7 +104,7 @@ def test_a_checklist_is_printed_without_what_belongs_to_the_screen(server: Serve
     with screen(browser, server.url) as desk:
         desk.sign_in("grace", password_of("grace"))
         page = desk.page
-        page.get_by_role("link", name="Checklist to print of A small procedure").click()
+        follow(page.get_by_role("link", name="Checklist to print of A small procedure"))
         expect(page.get_by_role("heading", name="A small procedure")).to_be_visible()
         page.evaluate("window.print = () => { window.printed = true; }")
         page.get_by_role("button", name="Print").click()

@@ -28,10 +28,10 @@ from service.compute.board.board import Board
 from service.compute.board.next_poses import draw_board_plan, suggest_board_poses
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.compute.hand_eye.reprojection import BoardCorners
+from service.compute.hand_eye.setup import robust_start
 from service.compute.poses.pose_files import write_poses_csv
 from service.compute.poses.robot_files import read_joints_csv
-from service.core.arms.known import arm_model
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from service.jobs import records
@@ -164,6 +164,14 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
     assert away_mm < 3 * result.corrected.sigma_mm
     assert result.arm_held_out_mm["geometry+gears"] < result.arm_held_out_mm["geometry"]
     assert np.all((np.array(record.observed) >= 0) & (corrected.correction.observed <= 1))
+
+
+def test_the_start_keeps_the_one_view_that_was_turned_far_though_it_fits_worst() -> None:
+    """Before, it was left out with the worst quarter of nine, and the others gave the board a negative size."""
+    scene = Scene.generate(127, arm_errors="both")
+    session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=1280)
+    found = robust_start(session.T_base_flange, session.T_camera_board, np.random.default_rng(0))
+    assert found.scale == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.slow

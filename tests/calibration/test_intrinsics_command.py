@@ -21,11 +21,11 @@ from service.compute.poses.camera_files import read_camera_json
 from service.core.errors import DataError
 from service.core.geometry import transform
 from service.core.protocol.models import load_protocol
+from service.core.records.base import Moment
 from service.core.records.events import ViewpointCaptured
-from service.core.records.moments import Moment
 from service.steps import params_models
-from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.context import StepContext
+from service.steps.optics import departing_images, optics_departures
 from tests.support.boards.board_images import checkerboard, photograph
 
 CAMERA = CameraModel(900, 600, 1260, 1261, 452.0, 301.0, -0.045, 0.03, 4e-4, -5e-4)

@@ -84,9 +84,9 @@ def test_it_starts_without_numerics(words: str, data: Path) -> None:
 def test_the_state_of_a_run_that_computes_is_told_without_numerics(tmp_path: Path) -> None:
     outcome = said_by(LOADED, "status", "latest", "--json", "--data", str(unpack_recorded_run(tmp_path)))
     assert outcome["status"] == 0
-    assert "service.steps.poses.time_left" in outcome["modules"]
+    assert "service.steps.due_jobs" in outcome["modules"]
     assert not (NUMERICS | OF_THE_WEB | OF_AN_OLD_STORE | {"rich.progress"}) & set(outcome["modules"])
-    not_of_this_run = {"service.steps.kinds.captures.manual_capture", "service.steps.kinds.results.layout_check"}
+    not_of_this_run = {"service.steps.kinds.manual_capture", "service.steps.kinds.layout_check"}
     assert not not_of_this_run & set(outcome["modules"])
 
 
@@ -95,7 +95,7 @@ def test_a_server_is_ready_before_it_has_what_single_pages_need(data: Path, tmp_
     outcome = said_by(AT_READY, "serve", "--rig", str(rig), "--data", str(tmp_path / "new"), "--port", "0", "--json")
     assert outcome["status"] == 0
     assert set(outcome["modules"]) >= OF_THE_WEB
-    of_single_pages = {"segno", "rfc3161_client", "service.steps.poses.time_left"}
+    of_single_pages = {"segno", "rfc3161_client", "service.steps.due_jobs"}
     assert not (NUMERICS | OF_AN_OLD_STORE | of_single_pages) & set(outcome["modules"])
 
 

@@ -24,13 +24,12 @@ from service.cli.main import app
 from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.compute.matching.methods.method import matchers
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import load_protocol
+from service.core.protocol.models import irreversible_warning, load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.exporter import exporters
 from service.jobs.words import term
 from service.steps import params_models
-from service.steps.capture.live_numbers import seen_words
+from service.steps.live_numbers import seen_words
 from tests.support.processes.forked import Forked
 
 ROOT = Path(__file__).parents[2]
@@ -114,8 +113,26 @@ def test_every_command_is_named_in_the_help_and_the_version_is_told() -> None:
     assert re.fullmatch(r"orthocapture \d+\.\d+\.\d+\S*\n", _output("--version")[1])
 
 
+def test_the_help_groups_every_command_by_what_it_is_for() -> None:
+    _, shown = _output("--help")
+    titles = re.findall(r"╭─ (.+?) ─+╮", shown)
+    assert titles == [
+        "Options",
+        "Capture",
+        "Evidence and data sets",
+        "Calibration and computing",
+        "Site",
+        "Development",
+    ]
+    listed = re.findall(r"(?m)^│ ([a-z][a-z-]*) +\S", shown)
+    assert len(listed) == len(set(listed))
+    documented = (ROOT / "docs/reference/commands.md").read_text()
+    assert set(listed) == set(re.findall(r"(?m)^## orthocapture ([a-z-]+)$", documented))
+    assert all(len(line) <= 80 for line in shown.splitlines())
+
+
 def test_the_shell_completes_commands() -> None:
-    assert _completed("orthocapture re", 1) == ["resume", "register", "replay"]
+    assert _completed("orthocapture re", 1) == ["resume", "replay", "register"]
     assert _completed("orthocapture calibrate ", 2) == ["intrinsics", "hand-eye"]
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from service.core.equipment.camera_bodies import bodies_of
-from service.core.equipment.recorded_devices import RecordedIdentity
+from service.core.recorded_devices import RecordedIdentity, bodies_of
 
 SONY = RecordedIdentity(kind="camera", serial="3282933005318008")
 

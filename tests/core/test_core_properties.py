@@ -22,7 +22,7 @@ from service.core.records.events import (
     StepStarted,
     ViewpointFailed,
 )
-from service.core.recovery.policy import recovery_policy
+from service.core.recovery import recovery_policy
 from service.core.run.actions import refuse
 from service.core.run.decide import (
     Accept,

@@ -35,7 +35,7 @@ from service.core.run.decide import (
     fold,
     initial_state,
 )
-from service.core.run.effects.place import is_void
+from service.core.run.effects import is_void
 from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, kind_of
 from service.core.run.state import Status
 from tests.support.record.core import GOOD, TOY, Log, captured, toy_protocol

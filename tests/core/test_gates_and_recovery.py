@@ -16,8 +16,7 @@ from service.core.records.events import (
     Uncertainty,
     ViewpointFailed,
 )
-from service.core.recovery.policy import NEEDS_A_PERSON, TRIED_AGAIN, recovery_policy
-from service.core.recovery.ways_on import ways_on
+from service.core.recovery import NEEDS_A_PERSON, TRIED_AGAIN, recovery_policy, ways_on
 from service.core.run.decide import (
     Halt,
     Retry,
@@ -68,7 +67,9 @@ def test_a_number_with_its_uncertainty_is_judged_by_its_bounds(lower: float, upp
     assert (found, result.passed) == (outcome, outcome == "passed")
     assert (verdict.lower, verdict.upper, verdict.sigma) == (lower, upper, 0.2)
     places = 2 if outcome == "failed" else 1
-    assert f"views {3.2:.{places}f} views, {lower:.{places}f} to {upper:.{places}f}, allowed" in describe(verdict)
+    assert f"Board images used {3.2:.{places}f} views, {lower:.{places}f} to {upper:.{places}f}, allowed" in describe(
+        verdict
+    )
     without = evaluate_gates(step, 1, {"views": 3.2, "sharp": 0.5}).verdicts[0]
     assert without.passed
     assert without.lower is None
@@ -159,7 +160,7 @@ def test_failed_gates_ask_and_can_be_overridden_only_with_leave_and_reason() -> 
     log.begin()
     log.measure(views=2.0, sharp=0.5)
     assert log.question.for_ == "recovery"
-    assert "views 2 views, allowed ≥ 3" in log.question.text
+    assert "Board images used 2 views, allowed ≥ 3" in log.question.text
     assert set(log.question.options) == {"confirm", "redo", "skip", "pause", "abort"}
     refused(log, "needs a reason", action="skip")
     log.act("skip", reason="the animal moved")

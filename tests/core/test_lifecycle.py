@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from service.core.documents.protocol_docs import lifecycle_text
+from service.core.documents import lifecycle_text
 from service.core.errors import IllegalTransitionError
 from service.core.run.lifecycle import (
     ABORTED,

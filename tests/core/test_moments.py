@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from service.core.records.moments import Moment, age_s, elapsed
+from service.core.records.base import Moment, age_s, elapsed
 from service.monitor.snapshot import Snapshot
-from service.steps.kinds.by_hand.timed_application import Result
+from service.steps.kinds.timed_application import Result
 
 _EARLIER = Moment(5000.0, "2026-11-21T12:00:00.000000Z", "a")
 

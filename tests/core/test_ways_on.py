@@ -18,13 +18,10 @@ from drivers.errors import DeviceFaultError
 from service.cli.main import app
 from service.core import errors as core_errors
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import parse_protocol
+from service.core.protocol.models import irreversible_warning, parse_protocol
 from service.core.protocol.step_params import StepParams
 from service.core.records.events import OperatorAction, OperatorVerb, StepNote
-from service.core.recovery.policy import NEEDS_A_PERSON
-from service.core.recovery.ways_on import WayOn, takes_words, view_s, ways_on
-from service.core.recovery.words import REMEDIES
+from service.core.recovery import NEEDS_A_PERSON, REMEDIES, WayOn, takes_words, view_s, ways_on
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.runner.operator import AnswerBy
@@ -197,7 +194,7 @@ def test_a_mend_comes_first_and_costs_its_views() -> None:
     assert [way.verb for way in ways_on(log.protocol, log.state)][-2:] == ["abort", "accept"]
     accept = ways_on(log.protocol, log.state)[-1]
     assert not accept.available
-    assert "allows nobody to accept views" in accept.why_not
+    assert "allows nobody to accept Board images used" in accept.why_not
 
 
 def test_a_step_whose_requirement_cannot_be_done_again_may_be_left_out() -> None:

@@ -26,7 +26,7 @@ from service.dataset.summary import summarise
 from service.import_folder import CtReading, find_places, import_rig, list_import
 from service.run_start import recorded_rig, recorded_run, start_run
 from service.steps import params_models
-from service.steps.kinds.imports.image_import import StatedSettings, stated_settings_agree
+from service.steps.kinds.image_import import StatedSettings, stated_settings_agree
 from service.store.database.engine import database_path
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -89,7 +89,7 @@ def test_one_more_photograph_is_asked_for_and_nothing_is_called_stopped(web: Web
     assert re.search(
         r'<button class="target primary"[^>]*>\s*<span class="button-words"><span>Take photograph 2', html
     )
-    assert "So far: Layout margin 0.5" in said
+    assert "So far: Margin against confusing four spheres 0.5" in said
     assert "data-lens-step" in html
     assert "Live view, to aim by" in said
     assert re.search(r'data-attention="waits" data-words="Check the layout: one more photograph', html)
@@ -125,7 +125,7 @@ def test_the_second_photograph_decides_and_its_verdict_stays_while_the_next_step
     page = f"/runs/{bench.run_id}"
     html = browser.get(page).text
     assert "Check the layout: passed" in words(html)
-    assert "Layout margin 0.5" in words(html)
+    assert "Margin against confusing four spheres 0.5" in words(html)
     (seq,) = re.findall(r'data-judged="(\d+)"', html)
     assert int(seq) == bench.state().steps["layout"].passed_seq
     assert "data-judged" not in browser.get(page, params={"step": "fixation"}).text, "there it stands itself"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import read_run
-from service.core.jobs.references import jobs_of
+from service.core.jobs import jobs_of
 from service.dataset.summary import RunSummary
 from service.dataset.view_covariances import own_pose_errors
 

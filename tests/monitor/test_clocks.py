@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivers.interfaces import DeviceReport
-from service.core.equipment.clocks import ClockReading, clock_readings
+from service.core.clocks import ClockReading, clock_readings
 from service.core.records.events import DeviceOpened, HostClock, Payload, SessionStarted
 from service.monitor.host import host_clock
 from service.store.records import NewArtefact

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.images.photographs import image_quality
-from service.steps.capture.spoilt import IN_A_ROW, ImageSharpness, last_in_a_row, why_spoilt
+from service.steps.retakes import IN_A_ROW, ImageSharpness, last_in_a_row, why_spoilt
 from tests.support.scenes.sphere_images import REGISTRATION_M, render, scene
 
 Grey = NDArray[np.uint8]

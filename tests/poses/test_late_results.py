@@ -27,7 +27,6 @@ from service.audit.verify.bundle_verifier import main as verify_bundle
 from service.cli.operators import Display
 from service.cli.run import wait_for_results
 from service.core.gates.verdict import evaluate_gates
-from service.core.jobs.priorities import LATER
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (
     FilesKept,
@@ -45,8 +44,8 @@ from service.rig import load_rig
 from service.run_record import RunRecord, read_log
 from service.run_start import start_run
 from service.steps import params_models
-from service.steps.poses.sources import PLANNED
-from service.steps.poses.time_left import missing_results
+from service.steps.due_jobs import missing_results
+from service.steps.registration_sources import PLANNED
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.core.geometry import Array
-from service.core.jobs.references import Reference
+from service.core.jobs import Reference
 from service.jobs.records import FurtherArm, Mounting, PosedPhotograph, matrix
 from service.jobs.registration import detect_spheres
 from service.steps.context import JobRequest

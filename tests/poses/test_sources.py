@@ -11,21 +11,18 @@ import pytest
 
 from service.cli.status import status_record
 from service.core.geometry import look_at
-from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
 from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, RunStarted
-from service.core.results.arrival import late_s, late_words
 from service.core.run.fold import fold, initial_state
-from service.core.run.state import JobState, Note, RunState
+from service.core.run.state import LATER, REDUCED, WAITED, JobState, Note, RunState
 from service.dataset.registrations import better_later, evaluated, own_registration, registrations
 from service.dataset.summary import RunSummary
 from service.run_record import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
-from service.steps.poses.due_jobs import due
-from service.steps.poses.registration_jobs import recorded_registration_jobs
-from service.steps.poses.sources import PLANNED, decisive
-from service.steps.poses.time_left import missing_results
+from service.steps.due_jobs import due, missing_results
+from service.steps.registration_jobs import recorded_registration_jobs
+from service.steps.registration_sources import PLANNED, decisive
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -13,8 +13,8 @@ import psutil
 import pytest
 
 from service.core.errors import ComputeError, StoreError
-from service.core.jobs.priorities import EARLY, LATER, LIVE, WAITED
 from service.core.records.events import JobFailed, JobFinished, StepNote
+from service.core.run.state import EARLY, LATER, LIVE, WAITED
 from service.store.records import Job, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify

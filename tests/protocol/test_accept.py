@@ -18,7 +18,7 @@ from service.cli.main import app
 from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import ProtocolError
-from service.core.gates.dependence import dependent_steps, depends_on
+from service.core.gates.acceptance import dependent_steps, depends_on
 from service.core.protocol.models import load_protocol
 from service.core.protocol.rules import NEVER_ACCEPTED
 from service.core.records.events import ActionRefused, OperatorAction
@@ -102,7 +102,7 @@ def test_an_accepted_step_passes_and_counts_for_what_requires_it() -> None:
     assert unmet_requirements(log.protocol.step("spray"), log.state) == ()
     deviation = next(d for d in log.state.deviations if d.kind == "gate_accepted")
     assert deviation.actor == "Emmy"
-    assert deviation.text.startswith("views 2 views, allowed ≥ 3; accepted by Emmy")
+    assert deviation.text.startswith("Board images used 2 views, allowed ≥ 3; accepted by Emmy")
     assert fold(log.protocol, log.events) == log.state
 
 
@@ -110,10 +110,10 @@ def test_it_is_refused_where_the_protocol_does_not_say_so() -> None:
     log = at_failed_capture(TOY)
     assert "accept" not in log.question.options
     accept(log)
-    assert "allows nobody to accept views" in last_refusal(log)
+    assert "allows nobody to accept Board images used" in last_refusal(log)
     half = at_failed_capture(TOY_ACCEPTING.replace(", accept_by: another_supervisor", ""), sharp=3.0)
     accept(half)
-    assert "allows nobody to accept sharp" in last_refusal(half)
+    assert "allows nobody to accept Sharp outside" in last_refusal(half)
 
 
 @pytest.mark.parametrize(

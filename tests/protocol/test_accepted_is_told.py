@@ -41,10 +41,12 @@ def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> No
     shown = render_html(report_content(run, verify(data, run_id), with_scene=False, with_pictures=False))
     plain = words(shown)
     assert plain.index("gate accepted") < plain.index("redo")  # listed first among the deviations
-    assert plain.count("Depends on an accepted gate: Evaluate: best_mean_radial_error_mm " + text) >= 2
+    assert (
+        plain.count("Depends on an accepted gate: Evaluate: Mean radial error of the registration used " + text) >= 2
+    )
     write_data_set(data_set_of(run.summary()), exporter("plain"), folder / "dataset")
     described = json.loads((folder / "dataset" / "dataset.json").read_text())
-    assert described["accepted_gates"] == [f"Evaluate: best_mean_radial_error_mm {text}"]
+    assert described["accepted_gates"] == [f"Evaluate: Mean radial error of the registration used {text}"]
     with Store.open(data) as store:
         bundle = export_bundle(store, run_id, folder / "bundle.zip", actor="Emmy", hashes_only=True).path
     verifier = ROOT / "service" / "audit" / "verify" / "bundle_verifier.py"

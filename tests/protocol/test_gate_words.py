@@ -42,13 +42,13 @@ def verdict(value: float | None, lower: float | None = None, upper: float | None
 @pytest.mark.parametrize(
     ("judged", "shown", "line"),
     [
-        (verdict(0.2), "0.2 mm", "error_mm 0.2 mm, allowed ≤ 0.35"),
-        (verdict(0.34, 0.3, 0.38), BOUNDED, f"error_mm {BOUNDED}, allowed ≤ 0.35: not decided"),
+        (verdict(0.2), "0.2 mm", "Error 0.2 mm, allowed ≤ 0.35"),
+        (verdict(0.34, 0.3, 0.38), BOUNDED, f"Error {BOUNDED}, allowed ≤ 0.35: not decided"),
         (verdict(0.2, 0.1999, 0.2001), "0.2000 mm, 0.1999 to 0.2001", ""),
         (verdict(0.2, 0.2, 0.2), "0.20 mm, 0.20 to 0.20", ""),
         (verdict(0.34, upper=0.38), "0.34 mm", ""),  # a bound alone is not shown as if there were two
         (verdict(0.34, lower=0.3), "0.34 mm", ""),
-        (verdict(None), "not measured", "error_mm was not measured, allowed ≤ 0.35"),
+        (verdict(None), "not measured", "Error was not measured, allowed ≤ 0.35"),
     ],
 )
 def test_a_figure_is_written_one_way(judged: GateVerdict, shown: str, line: str) -> None:
@@ -92,7 +92,7 @@ def test_the_first_page_counts_what_is_not_decided_apart(undecided: tuple[Path, 
 def test_the_report_shows_bounds_and_says_what_they_are(undecided: tuple[Path, str]) -> None:
     data, run_id = undecided
     page = render_html(report_content(read_run(data, run_id), verify(data)))
-    assert f"best_mean_radial_error_mm {BOUNDED}, allowed ≤ 0.35: not decided" in page
+    assert f"Mean radial error of the registration used {BOUNDED}, allowed ≤ 0.35: not decided" in page
     assert "gate not decided" in page
     assert "? not decided" in page
     assert page.count("0.030 px, 0.023 to 0.037") == 2  # steps and gates, certificate
@@ -113,8 +113,8 @@ def test_the_command_shows_every_figure(undecided: tuple[Path, str], monkeypatch
     data, run_id = undecided
     monkeypatch.setattr(console, "width", 220)  # a narrower table breaks its lines
     done = CliRunner().invoke(app, ["status", run_id, "--data", str(data)])
-    assert f"best_mean_radial_error_mm {BOUNDED}, allowed ≤ 0.35: NOT DECIDED" in done.output
-    assert "rms_px 0.030 px, 0.023 to 0.037, allowed ≤ 0.5: ok" in done.output
+    assert f"Mean radial error of the registration used {BOUNDED}, allowed ≤ 0.35: NOT DECIDED" in done.output
+    assert "RMS reprojection error 0.030 px, 0.023 to 0.037, allowed ≤ 0.5: ok" in done.output
     told = json.loads(CliRunner().invoke(app, ["status", run_id, "--data", str(data), "--json"]).output)
     (gate,) = told["steps"]["evaluation"]["gates"]
     assert (gate["standing"], gate["lower"], gate["upper"]) == ("not_decided", 0.3, 0.38)
@@ -126,8 +126,10 @@ def test_the_data_set_tells_how_its_gates_stand(tmp_path: Path) -> None:
     dataset = data_set_of(read_run(tmp_path / "data", run_id).summary())
     write_data_set(dataset, exporter("plain"), tmp_path / "out")
     told = json.loads((tmp_path / "out" / "dataset.json").read_text())
-    assert told["gates"]["evaluation"] == [f"best_mean_radial_error_mm {BOUNDED}, allowed ≤ 0.35: accepted"]
-    assert told["gates"]["calibration"] == ["rms_px 0.030 px, 0.023 to 0.037, allowed ≤ 0.5: within"]
+    assert told["gates"]["evaluation"] == [
+        f"Mean radial error of the registration used {BOUNDED}, allowed ≤ 0.35: accepted"
+    ]
+    assert told["gates"]["calibration"] == ["RMS reprojection error 0.030 px, 0.023 to 0.037, allowed ≤ 0.5: within"]
 
 
 @pytest.fixture

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from drivers.interfaces import Abandoned
 from service.cli.main import app
-from service.core.arms.known import known_arms
-from service.core.arms.model import ArmModel
+from service.core.arms.model import ArmModel, known_arms
 from service.core.arms.motion_limits import motion_problems
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import Motion, load_protocol

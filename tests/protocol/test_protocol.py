@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from service.core.documents.protocol_docs import lifecycle_text, schema_text
+from service.core.documents import lifecycle_text, schema_text
 from service.core.errors import ProtocolError
 from service.core.protocol.models import load_protocol, protocol_json_schema
 from tests.support.record.core import KINDS, TOY, CaptureParams, ChecklistParams, load
@@ -190,5 +190,5 @@ def test_the_generated_documents() -> None:
     assert json.loads(schema_text(KINDS)) == protocol_json_schema(KINDS)
     page = lifecycle_text(load(TOY).protocol)
     assert "| spray | spray | Spray | yes |  | yes | capture |  |" in page
-    assert "views ≥ 3 views; sharp ≥ 0.2 and ≤ 1" in page
+    assert "Board images used ≥ 3 views; Sharp ≥ 0.2 and ≤ 1" in page
     assert "```mermaid\nstateDiagram-v2" in page

@@ -10,8 +10,8 @@ import pytest
 from drivers.errors import DeviceTimeoutError
 from service.core.records.events import LeaveLapsed, OperatorAction, StepFailed, StepRetried
 from service.core.run.decide import AskOperator
+from service.core.run.expected import tries_words
 from service.core.run.state import RunState
-from service.core.run.tries import tries_words
 from service.monitor.snapshot import SignOfLife
 from service.runner import leave
 from service.runner.held_run import held_run

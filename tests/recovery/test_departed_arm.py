@@ -12,7 +12,7 @@ from drivers.interfaces import RobotState
 from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.steps.capture.motion import STANDS_RAD, require_there
+from service.steps.motion import STANDS_RAD, require_there
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import VIEWS, Bench
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.errors import DeviceUnavailableError
-from service.core.equipment.exchanged import exchanged
-from service.core.equipment.recorded_devices import RecordedIdentity
+from service.core.recorded_devices import RecordedIdentity, exchanged
 from service.core.records.events import DeviceOpened, DeviceTrouble, OperatorAction, StepFailed
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState

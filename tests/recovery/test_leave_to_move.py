@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from service.core.records.events import OperatorAction, SessionStarted, StepFailed, StepStarted
-from service.core.recovery.policy import recovery_policy
+from service.core.recovery import recovery_policy
 from service.core.run.decide import AskOperator, Retry, RunStep
 from tests.support.record.core import TOY, Log, captured, toy_protocol
 from tests.support.record.core_log import assert_refused

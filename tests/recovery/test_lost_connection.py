@@ -18,9 +18,8 @@ from service.core.records.events import (
     RunAborted,
     SessionStarted,
 )
-from service.core.run.connections import connected_arms, lost_arms
 from service.core.run.decide import AskOperator
-from service.core.run.state import RunState
+from service.core.run.state import RunState, connected_arms, lost_arms
 from service.monitor.snapshot import Snapshot
 from service.steps.context import ConnectionEnd
 from service.web.page.robot_banner import Banner, LookAt, robot_banner

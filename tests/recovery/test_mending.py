@@ -25,7 +25,7 @@ from service.run_start import recorded_run, start_run
 from service.runner.loop import Runner
 from service.steps import params_models
 from service.steps.context import StepContext
-from service.steps.kinds.captures import viewpoint_capture
+from service.steps.kinds import viewpoint_capture
 from tests.support.rig.bench_rig import other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, bench_store
 

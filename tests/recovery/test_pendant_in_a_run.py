@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.arms.flange import flange_pose, pose_gap
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model, flange_pose, pose_gap
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
 from service.store.verification.verify import verify

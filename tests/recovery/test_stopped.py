@@ -115,4 +115,4 @@ def run_protocol(web: WebSite, run: Bench) -> Protocol:
 
 def test_a_limit_from_above_and_one_that_is_not_decided() -> None:
     high = GateVerdict(measure="five_fold_rms_px", value=0.71, minimum=None, maximum=0.5, unit="px", passed=False)
-    assert needs(high) == "Five fold RMS 0.71 px, needs at most 0.5 px"
+    assert needs(high) == "RMS reprojection error in cross-validation 0.71 px, needs at most 0.5 px"

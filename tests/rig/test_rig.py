@@ -237,7 +237,6 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
         assert "Traceback" not in log
 
 
-@pytest.mark.slow
 def test_a_rig_has_the_camera_that_was_recorded(tmp_path: Path) -> None:
     with simulated_rig(tmp_path, *SMALL, "--recorded", "ilce-7rm5-2.02", host=OWN_HOST) as ready:
         camera = driver(load_rig(Path(ready["rig"])).section.devices["camera"]["port"])
@@ -249,7 +248,6 @@ def test_a_rig_has_the_camera_that_was_recorded(tmp_path: Path) -> None:
             camera.close()
 
 
-@pytest.mark.slow
 def test_only_a_sony_can_be_one_that_was_recorded(tmp_path: Path) -> None:
     words = ("--scene", "3", "--dir", str(tmp_path), "--camera", "Canon EOS R5", "--recorded", "ilce-7rm5-2.02")
     answer = orthocapture("simulate", "rig", *words)
@@ -376,3 +374,24 @@ def test_a_device_that_dies_is_switched_on_again_at_its_address(tmp_path: Path) 
 
         until(answers, "the camera does not answer again")
         assert Path(ready["rig"]).read_bytes() == before
+
+
+@pytest.mark.slow
+def test_somebody_at_a_terminal_reads_what_to_type_next_and_a_program_does_not(tmp_path: Path) -> None:
+    words = ("--dir", str(tmp_path / "a rig"), *SMALL, "--host", OWN_HOST)
+    with RigLock(OWN_HOST):
+        screen, terminal = os.openpty()
+        with subprocess.Popen(
+            [sys.executable, "-m", "simulators", "rig", *words], cwd=REPOSITORY, stdout=terminal, stderr=terminal
+        ) as process:
+            os.close(terminal)
+            try:
+                shown = ""
+                while "orthocapture run demo" not in shown:
+                    shown += os.read(screen, 4096).decode()
+            finally:
+                process.terminate()
+                os.close(screen)
+    assert f"orthocapture serve --rig '{tmp_path}/a rig/rig.yaml' --data runs" in shown
+    with simulated_rig(tmp_path, *SMALL, host=OWN_HOST):
+        assert "orthocapture run" not in (tmp_path / "rig.log").read_text()

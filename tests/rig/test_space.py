@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.equipment.disk_space import LEAST_FREE_BYTES, Usage, forecast
+from service.core.disk_space import LEAST_FREE_BYTES, Usage, forecast
 from service.core.errors import SpaceShortError
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import OperatorAction, StepFailed, StepNote

@@ -16,7 +16,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.intrinsics.estimate import calibrate_intrinsics
 from service.compute.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.core.geometry import Array, Transform, apply, increment, inverse, transform
-from service.steps.board.plan import FIRST
+from service.steps.board_plan import FIRST
 
 BOARD = Board(16, 23, 0.015)
 CAMERA = CameraModel(1920, 1280, 2688.0, 2688.0, 959.5, 639.5)

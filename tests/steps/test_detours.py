@@ -12,9 +12,9 @@ import pytest
 
 from service.core.geometry import Array
 from service.core.records.events import OperatorAction, ViewpointFailed
-from service.steps.capture.plan import planning
-from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
-from service.steps.kinds.captures import viewpoint_capture
+from service.steps import planning
+from service.steps.kinds import viewpoint_capture
+from service.steps.viewpoints import Viewpoint, flange_target
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, bench_store
 
 BETWEEN_RAD = (np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]), np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7]))

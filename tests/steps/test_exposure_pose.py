@@ -10,7 +10,7 @@ from drivers.arm.stream import judge
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState, SettleCriteria
 from service.core.geometry import Array, rotation_angle_rad, transform
-from service.steps.capture.exposure import exposure_pose
+from service.steps.exposure import exposure_pose
 
 TURNED = Rotation.from_euler("xyz", [0.4, -2.0, 1.1])
 

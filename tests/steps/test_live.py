@@ -23,7 +23,7 @@ from service.compute.planning.coverage import (
     CoverageLimits,
 )
 from service.compute.registration.hypotheses import paired
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
 from service.jobs.capture import live_view
@@ -312,7 +312,7 @@ def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
     wanted = [view["viewpoint"] for note in suggestions for view in note["viewpoints"]]
     assert wanted, "some views are suggested"
     for text, note in zip(asked, suggestions, strict=True):
-        assert "predicted_target_error_mm" in text
+        assert "Predicted error at the specimen" in text
         assert all(view["viewpoint"] in text for view in note["viewpoints"])
     assert bench.captured()[1:5] == ["v001", "v002", "v003", "v004"]
     assert sorted(bench.captured()[5:]) == sorted(wanted), "by the names that were shown, and nothing again"
@@ -389,7 +389,7 @@ def test_images_that_nobody_looked_at_are_counted_and_judged_when_the_worker_is_
             compute(what)
 
     def back(question: Any, _state: Any) -> Any:
-        assert "images_unexamined 3 images, allowed ≤ 0" in question.text
+        assert "Images not examined 3 images, allowed ≤ 0" in question.text
         assert "is a worker running?" in question.text
         bench.operator.on_show = compute
         return answer(question, "confirm")
@@ -423,7 +423,7 @@ def test_images_to_take_again_and_views_to_add_are_told_together_and_taken_by_on
     assert bench.run().status == "completed"
     first = asked[0].text
     assert "set the camera as the protocol has it" in first
-    assert "Confirm to take 1 image again; all others are kept. predicted_target_error_mm is" in first
+    assert "Confirm to take 1 image again; all others are kept. Predicted error at the specimen is" in first
     assert "The same confirmation also takes" in first
     note = next(n.data for n in bench.payloads(StepNote) if n.note == "suggested_viewpoints")
     wanted = [view["viewpoint"] for view in note["viewpoints"]]
@@ -456,7 +456,7 @@ def test_an_operator_is_told_what_is_missing_and_what_would_help(begin: Callable
     advice = "Confirm to take 1 more views (vt25+40)"
 
     def told(question: Any, _state: Any) -> Any:
-        assert "predicted_target_error_mm was not measured, allowed ≤ 0.3" in question.text
+        assert "Predicted error at the specimen was not measured, allowed ≤ 0.3" in question.text
         assert advice in question.text
         return answer(question, "abort", reason="seen enough")
 

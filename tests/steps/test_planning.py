@@ -36,17 +36,17 @@ from service.compute.planning.motion_plan import (
     shortest_order,
     travel_times_s,
 )
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.plan.planning import ArmAtStation, usual_posture
-from service.steps.capture.plan.preview import preview_board_poses, preview_plans
-from service.steps.capture.plan.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds.captures import viewpoint_capture
+from service.steps.kinds import viewpoint_capture
+from service.steps.plan_preview import preview_board_poses, preview_plans
+from service.steps.planning import ArmAtStation, usual_posture
+from service.steps.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"
 ARM = arm_model("UR10e")

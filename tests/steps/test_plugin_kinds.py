@@ -145,5 +145,5 @@ def test_the_protocol_check_and_the_documents_know_its_measures(seen: dict[str, 
     (problem,) = seen["problems"]
     assert "weight_mg" in problem
     assert "## weighing" in seen["step_page"]
-    assert "| `weight_g` | g | 1 to 100000 | mean of the readings |" in seen["step_page"]
+    assert "| `weight_g` | Weight g | g | 1 to 100000 | mean of the readings |" in seen["step_page"]
     assert "## weigh\n" in seen["job_page"]

@@ -10,9 +10,9 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.core.records.events import StepNote
-from service.steps.capture.plan import planning
-from service.steps.capture.plan.viewpoints import Viewpoint
-from service.steps.kinds.captures import viewpoint_capture
+from service.steps import planning
+from service.steps.kinds import viewpoint_capture
+from service.steps.viewpoints import Viewpoint
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.arms.flange import flange_pose
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model, flange_pose
 from service.core.geometry import Transform, transform
 from service.core.records.events import DeviceOpened
 from service.store.records import NewArtefact

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from service.core.errors import IntegrityError
-from service.core.jobs.references import Each, Reference, references_in, resolve
+from service.core.jobs import Each, Reference, references_in, resolve
 from service.core.records.events import ArtefactRef
 from service.core.run.state import JobState
 

@@ -23,7 +23,7 @@ import yaml
 from service.audit.record.run import read_run
 from service.audit.replay.recomputed import CopiedResults
 from service.cli.demo import free_address
-from service.core.jobs.references import jobs_of, references_in
+from service.core.jobs import jobs_of, references_in
 from tests.support.processes.package import Package, installed_package
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import RIG_LOCK, orthocapture

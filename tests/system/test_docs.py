@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -64,13 +65,13 @@ def site(tmp_path: Path, recorded: tuple[Path, str]) -> Site:
 
 
 RUN_HERE: dict[str, Check] = {
-    "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
-    "orthocapture protocol check protocols/dry_run.yaml": succeeds,
+    "orthocapture protocol check exvivo_spine": succeeds,
+    "orthocapture protocol check dry_run": succeeds,
     "orthocapture doctor --rig rig.yaml": succeeds,
     "orthocapture doctor --rig rig.yaml --record devices.json": succeeds,
-    "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
+    "orthocapture run exvivo_spine --rig rig.yaml --data runs "
     '--operator "A. Name" --specimen "Spine 7"': starts_and_is_aborted,
-    'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
+    'orthocapture run dry_run --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
     "orthocapture resume latest --data runs": asks_and_is_aborted,
     "orthocapture status latest --data runs": succeeds,
     "orthocapture plan next latest --data runs": succeeds,
@@ -116,10 +117,10 @@ RUN_ELSEWHERE = {
     "--board 16x23 --square-mm 15 --out hand_eye.json": (
         "tests/calibration/test_hand_eye_arm.py::test_the_command_calibrates_photographs"
     ),
-    "orthocapture plan show protocols/exvivo_spine.yaml --rig rig.yaml": (
+    "orthocapture plan show exvivo_spine --rig rig.yaml": (
         "tests/steps/test_planning.py::test_the_command_plans_from_files_alone"
     ),
-    "orthocapture plan show protocols/dry_run.yaml --rig rig.yaml": (
+    "orthocapture plan show dry_run --rig rig.yaml": (
         "tests/rig/test_dry_run.py::test_every_viewpoint_is_planned_from_the_documented_rig_file"
     ),
     "orthocapture spheres --mesh scan.ply --radius-mm 15 --out spheres.json": (
@@ -164,6 +165,10 @@ RUN_ELSEWHERE = {
     "python -m bench.markers.detectors": (
         "tests/markers/test_grounded.py::test_all_detectors_are_measured_side_by_side"
     ),
+    **dict.fromkeys(
+        (". .venv/bin/activate", "orthocapture --help"),
+        "tests/system/test_docs.py::test_the_environment_is_activated_and_the_command_is_there",
+    ),
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not
@@ -171,12 +176,12 @@ RUN_ELSEWHERE = {
     ),
     **dict.fromkeys(
         ("make test-drawn", "make test-realtime", "make test-whole", "make test-sweeps"),
-        "tests/house/test_suite_rules.py::"
+        "tests/code_rules/test_suite_rules.py::"
         "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
     ),
     **dict.fromkeys(
         ("make marks", "make marks FILES=tests/core"),
-        "tests/house/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
+        "tests/code_rules/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
     ),
     "python -m tests.support.record.new_schema": (
         "tests/store/test_store_chain.py::test_a_new_database_is_what_the_migrations_make"
@@ -214,7 +219,7 @@ RUN_ELSEWHERE = {
         "tests/imports/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
     ),
     "orthocapture simulate rig --scene 7 --dir rig --second-camera stereo": (
-        "tests/further/test_second_camera_whole_run.py::test_the_extrinsics_are_true_within_their_covariance"
+        "tests/second_camera/test_second_camera_whole_run.py::test_the_extrinsics_are_true_within_their_covariance"
     ),
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/handheld/test_handheld.py::test_the_evidence_verifies"
@@ -238,7 +243,7 @@ RUN_ELSEWHERE = {
     'orthocapture audit rotate-key --lost --reason "disk died" --data restored': (
         "tests/store/test_backup.py::test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed"
     ),
-    "orthocapture doctor --rig rig.yaml --protocol protocols/exvivo_spine.yaml --data runs": (
+    "orthocapture doctor --rig rig.yaml --protocol exvivo_spine --data runs": (
         "tests/rig/test_space.py::test_doctor_and_pages_say_it_before_a_run"
     ),
     "orthocapture audit verify --signatures FILE": (
@@ -289,10 +294,10 @@ RUN_ELSEWHERE = {
             "orthocapture simulate rig --scene 7 --dir rig --scanner zivid",
             "orthocapture simulate rig --ct-sends-to 127.0.0.1:11112 --scene 7 --dir rig",
         ),
-        "tests/further/test_second_camera_whole_run.py::test_the_series_was_sent_and_the_scan_is_of_its_profile",
+        "tests/second_camera/test_second_camera_whole_run.py::test_the_series_was_sent_and_the_scan_is_of_its_profile",
     ),
     'orthocapture simulate rig --scene 7 --dir rig --camera "Canon EOS R5"': (
-        "tests/further/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
+        "tests/second_camera/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     "orthocapture simulate ct --scene 7 --folder ct --once --products": (
         "tests/scanner/test_scan_ct_simulators.py::test_the_products_of_one_acquisition_are_delivered_together"
@@ -342,6 +347,18 @@ def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
     file, name = test.split("::")
     module = ast.parse((ROOT / file).read_text(encoding="utf-8"))
     assert name in {node.name for node in module.body if isinstance(node, ast.FunctionDef)}, command
+
+
+def test_the_environment_is_activated_and_the_command_is_there(tmp_path: Path) -> None:
+    """As the README has it; `.venv` is where the Makefile puts what these tests run in."""
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    words = ". .venv/bin/activate && command -v orthocapture && orthocapture --help"
+    shell = subprocess.run(
+        ["/bin/sh", "-c", words], cwd=tmp_path, env={**os.environ, "PATH": "/usr/bin:/bin", "COLUMNS": "80"},
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert shell.returncode == 0, shell.stderr
+    assert "╭─ Capture" in shell.stdout
 
 
 def test_commands_are_found_in_blocks_tables_and_text() -> None:

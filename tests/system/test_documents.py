@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 from docs.generate.pages import REFERENCE, pages
+from docs.generate.rooms import layers, pages_with_rooms, rooms_table
 from docs.generate.steps import measures_of_kind
 from service.steps import step_kinds
 
@@ -62,10 +63,19 @@ def test_links_of_the_documents_lead_somewhere() -> None:
             assert "://" in target or (document.parent / target).exists(), f"{document.name}: {target}"
 
 
-def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
+def test_every_picture_beside_the_documents_is_shown_by_one() -> None:
+    """`python -m bench.pages.screens` takes all others whenever somebody wants to look at them."""
+    texts = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+    pictures = [path for part in ("screens", "images") for path in (ROOT / "docs" / part).iterdir()]
+    assert [
+        path.name for path in pictures if path.suffix != ".md" and f"{path.parent.name}/{path.name})" not in texts
+    ] == []
+
+
+def test_what_the_page_of_the_accuracy_says_of_a_corrected_arm_is_what_was_measured() -> None:
     """For errors of the simulated arm's own model, and for an arm with other errors (bench/calibration/hand_eye)."""
     measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-27.json").read_text())
-    text = " ".join((ROOT / "README.md").read_text().split())
+    text = " ".join((ROOT / "docs" / "explanation" / "accuracy.md").read_text().split())
     for kind, words in (("systematic", "poses good to {} mm once"), ("odd", "{} mm are left")):
         rows = [row for row in measured[kind] if row["session"].startswith("hand-eye step")]
         left = [row["error_mm"]["arm corrected"] for row in rows]
@@ -86,7 +96,10 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("mutants SEED=1", ".venv/bin/python -m bench.suite.mutants --seed 1 --count 300 --at-least 0"),
         ("demo", ".venv/bin/orthocapture demo"),
         ("lint", ".venv/bin/python -m bench.suite.marks --check"),
-        ("lock", "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt"),
+        (
+            "lock",
+            "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' .ci/constraints-dev.txt",
+        ),
         ("docs", ".venv/bin/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs"),
         ("reference", ".venv/bin/python -m docs.generate"),
         ("test-versions", ".ci/versions"),
@@ -105,10 +118,27 @@ def test_make_targets_do_what_the_documents_say() -> None:
         assert done.stdout.splitlines()[-1] == last
 
 
-def test_the_map_of_the_readme_names_every_module_of_the_service() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    listed = set(re.findall(r"^\| `service/([a-z_]+)(?:/|\.py)` \|", text, re.MULTILINE))
+def test_every_room_of_the_service_is_named_from_one_source() -> None:
+    """The contract of the layers names each room once; `make reference` writes them where people read them."""
     there = {
         path.stem for path in (ROOT / "service").iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()
     }
-    assert listed == there - {"__init__"}
+    rooms = [room for layer in layers() for room in layer]
+    assert sorted(rooms) == sorted(there - {"__init__"})
+    for path, text in pages_with_rooms().items():
+        written = path.read_text(encoding="utf-8")
+        assert written == text, f"{path.name}: run `make reference`"
+        assert [room for room in rooms if not re.search(rf"[/>]{room}(?:/|\.py|<)", written)] == []
+    assert all(line.rpartition(" | ")[2].strip(" |") for line in rooms_table().splitlines())
+
+
+def test_the_readme_fits_a_screen_and_maps_the_top_level() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 100
+    for folder in ("protocols", "drivers", "simulators", "service", "tests", "bench", "docs"):
+        assert re.search(rf"(?m)^\|.*`{folder}/`.*\|.*\|$", text), folder
+    assert len(re.findall(r"(?m)^\| .* \| `orthocapture .*` \|$", text)) == 10, "the commands of the first week"
+
+
+def test_the_changelog_of_a_version_that_nobody_has_fits_a_screen() -> None:
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 60

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from service.core.records.events import FilesKept, OperatorAction, RecordedView
-from service.core.recovery.ways_on import ways_on
+from service.core.recovery import ways_on
 from service.monitor.snapshot import RobotPhase, Snapshot, write_snapshot
 from service.people.person import ROLES, Role, may
 from service.web.page.run_frame import RunStanding, run_standing

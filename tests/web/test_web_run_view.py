@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import (
@@ -27,16 +28,15 @@ from service.core.records.events import (
     StepRetried,
     ViewpointFailed,
 )
-from service.core.recovery.ways_on import planned_views
+from service.core.recovery import planned_views
 from service.core.run.decide import AskOperator, decide, evaluate_gates
-from service.core.run.expected import duration
+from service.core.run.expected import duration, tries_words
 from service.core.run.fold import fold
-from service.core.run.tries import tries_words
-from service.core.text.clock_time import time_here
+from service.core.text.words import time_here
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
 from service.web.page.robot_banner import robot_banner
-from service.web.page.run_frame import limit, measure_name
+from service.web.page.run_frame import limit
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer, view_intervals_s
 from tests.support.record.core import Log
@@ -341,7 +341,12 @@ def test_a_redo_says_what_it_resets() -> None:
 
 @pytest.mark.parametrize(
     ("measure", "words"),
-    [("rms_px", "RMS"), ("five_fold_rms_px", "Five fold RMS"), ("tilt_deg", "Tilt"), ("views", "Views")],
+    [
+        ("rms_px", "RMS reprojection error"),
+        ("five_fold_rms_px", "RMS reprojection error in cross-validation"),
+        ("tilt_deg", "Largest tilt of the board"),
+        ("views", "Board images used"),
+    ],
 )
 def test_measures_have_names_for_people(measure: str, words: str) -> None:
     assert measure_name(measure) == words

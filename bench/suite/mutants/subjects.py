@@ -7,7 +7,7 @@ from pathlib import Path
 
 # Glob patterns; `**` takes whole folders.
 SUBJECTS: dict[str, tuple[str, ...]] = {
-    "decide": ("service/core/run/**/*.py", "service/core/recovery/policy.py", "service/core/recovery/ways_on.py"),
+    "decide": ("service/core/run/**/*.py", "service/core/recovery.py"),
     "gates": ("service/core/gates/*.py", "service/core/protocol/rules.py"),
     "leases": ("service/store/runs.py", "service/store/jobs.py"),
     "chain": ("service/store/events.py", "service/store/store.py", "service/store/durable_effects.py"),
@@ -44,7 +44,7 @@ OWN_TESTS: dict[str, tuple[str, ...]] = {
     "signatures": ("tests/verify",),
     "verifier": ("tests/store", "tests/verify"),
     "cost": ("tests/registration",),
-    "covariances": ("tests/registration", "tests/poses", "tests/calibration", "tests/further", "tests/core"),
+    "covariances": ("tests/registration", "tests/poses", "tests/calibration", "tests/second_camera", "tests/core"),
     "exporters": ("tests/dataset",),
     "fusion": ("tests/ground_truth", "tests/scanner"),
     "watchdogs": ("tests/robot", "tests/steps"),

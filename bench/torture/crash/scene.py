@@ -19,8 +19,8 @@ from drivers.photos.photo_folder import listed
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.core.geometry import Array, apply, from_rotation_vector, inverse, transform
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList
-from service.steps.capture.plan.viewpoints import Arc, Viewpoint, ViewpointSet, plan_viewpoints
 from service.steps.context import StationLayout
+from service.steps.viewpoints import Arc, Viewpoint, ViewpointSet, plan_viewpoints
 from service.store.durable_effects import utc_text
 from tests.support.rig.bench_rig import BenchArm, BenchCamera, BenchRig, numbered
 from tests.support.scenes.sphere_images import REGISTRATION_M, camera, render

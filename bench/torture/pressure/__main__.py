@@ -32,6 +32,7 @@ import psutil
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.torture.pressure.groups import Group, Limits, group
 from service.core.errors import OrthocaptureError
+from service.core.records.base import seconds_between
 from service.core.records.events import (
     DeviceTrouble,
     StepFailed,
@@ -39,7 +40,6 @@ from service.core.records.events import (
     StepStarted,
     ViewpointCaptured,
 )
-from service.core.records.moments import seconds_between
 from service.core.run.decide import AskOperator, decide, fold
 from service.run_start import recorded_run
 from service.store.store import Store

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from service.audit.bundle.contents import BundledRun, ManifestEntry
-from service.core.equipment.camera_bodies import bodies
-from service.core.equipment.recorded_devices import recorded_report
 from service.core.gates.acceptance import describe_accepted
+from service.core.recorded_devices import bodies, recorded_report
 from service.core.records.events import (
     ArtefactRef,
     DeviceOpened,

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, text
 
 from service.audit.record.rows import EventRow, plain, read_rows
-from service.core.equipment.camera_bodies import CameraBodies, bodies_of
-from service.core.equipment.recorded_devices import RecordedReport, recorded_report
+from service.core.recorded_devices import CameraBodies, RecordedReport, bodies_of, recorded_report
 from service.core.records.events import DeviceOpened, SessionStarted, ViewpointCaptured
 
 _LOOKED_AT = 500  # newest photographs; one that states another body is judged as a departing image anyway

@@ -25,7 +25,7 @@ from service.core.records.events import (
 )
 from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_state
 from service.core.run.state import Deviation, RunState
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.dataset.registrations import LateResult, late_results
 from service.jobs.registration import evaluate
 from service.store.store import Store

@@ -16,8 +16,8 @@ from service.audit.record.rows import EventRow, one_event, plain, read_rows, seq
 from service.core.errors import DataError
 from service.core.gates.verdict import quantity, uncertain
 from service.core.records.events import Event, RecordCorrected, Uncertainty
-from service.core.text.json_text import parse_json
-from service.core.text.reasons import reason_of
+from service.core.text.files import parse_json
+from service.core.text.words import reason_of
 from service.store.store import Store
 
 _UNCERTAINTIES = TypeAdapter(dict[str, Uncertainty])

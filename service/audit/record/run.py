@@ -96,7 +96,7 @@ def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> 
 
     The same events give the same lines, so the time that is left is not among them.
     """
-    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - as in service.run_record
+    from service.steps.due_jobs import missing_results  # noqa: PLC0415 - as in service.run_record
 
     return [
         f"{left.what}: {f'there will be none, {left.failed}' if left.failed else 'was still being computed'}"

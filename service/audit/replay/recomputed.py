@@ -15,9 +15,8 @@ import numpy as np
 from service.audit.record.run import RecordedFiles
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
-from service.core.jobs.references import Reference, jobs_of, resolve
+from service.core.jobs import Reference, computed_by, jobs_of, resolve
 from service.core.records.events import ArtefactRef, JobFinished
-from service.core.run.computed import computed_by
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary

@@ -16,7 +16,7 @@ from service.audit.replay.differences import Comparison, Difference, compare_dat
 from service.audit.replay.recomputed import Drift, RecomputedJobs, ScratchStore, drifts
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
-from service.core.jobs.references import jobs_of, resolve
+from service.core.jobs import jobs_of, resolve
 from service.core.records.events import ArtefactRef, GateVerdict, JobEnqueued, JobFinished, SessionStarted
 from service.core.run.state import JobState
 from service.jobs import job_kinds

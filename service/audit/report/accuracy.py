@@ -20,8 +20,8 @@ from service.audit.report.blocks import (
     utc,
     words,
 )
-from service.core.gates.dependence import depends_on
-from service.core.text.counts import counted
+from service.core.gates.acceptance import depends_on
+from service.core.text.words import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 from service.dataset.registrations import late_results, shared_adjustment_note
 from service.dataset.summary import RunSummary

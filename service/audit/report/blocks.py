@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import ClassVar, Literal
 
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing, figure, limits, standing
 from service.core.records.events import GateVerdict
 from service.jobs.words import term
@@ -241,12 +242,8 @@ def limit(verdict: GateVerdict) -> str:
 
 
 def measured(verdict: GateVerdict) -> tuple[str, str]:
-    """The name of a gate's measure without its unit, and the value with the unit."""
-    name = verdict.measure
-    for ending, unit in (("_mm", "mm"), ("_px", "px"), ("_deg", "°"), ("_min", "min")):
-        if verdict.unit == unit:
-            name = name.removesuffix(ending)
-    return words(name), figure(verdict)
+    """Return the name of a gate's measure, and its value with the unit."""
+    return measure_name(verdict.measure), figure(verdict)
 
 
 _JUDGED: dict[Standing, TableCell] = {

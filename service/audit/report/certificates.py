@@ -28,9 +28,9 @@ from service.audit.report.blocks import (
     measured,
     utc,
 )
-from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
-from service.core.gates.dependence import depends_on
+from service.core.gates.acceptance import depends_on
 from service.core.geometry import Array
+from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import RecordedView
 from service.core.units import mm
 from service.jobs.calibration import calibrate

@@ -29,7 +29,7 @@ from service.audit.report.photographs import about_facts, notes_section, picture
 from service.core.errors import OrthocaptureError
 from service.core.records.events import SessionStarted
 from service.core.records.import_list import imported_sentence
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.dataset.registrations import late_results
 from service.rig import parse_recorded_rig
 from service.store.verification.verify import AuditReport

@@ -36,7 +36,7 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.state import StepState
-from service.core.text.counts import counted
+from service.core.text.words import counted
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,11 +18,10 @@ from service.audit.report.blocks import (
     TableCell,
     clock,
 )
-from service.core.equipment.camera_bodies import CameraBodies, bodies
-from service.core.equipment.clocks import clock_offset_words, clock_readings
-from service.core.equipment.recorded_devices import recorded_report
+from service.core.clocks import clock_offset_words, clock_readings
+from service.core.recorded_devices import CameraBodies, bodies, recorded_report
 from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import megabytes, ms, um
 from service.jobs.words import term
 from service.steps.notes import deidentified

@@ -19,7 +19,7 @@ from service.audit.report.blocks import Drawing, Label, Line, Raster, Rectangle,
 from service.compute.evaluation.error_budget import Alignment
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, apply
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import metres, mm
 from service.dataset import scene_view
 from service.dataset.further_cameras import further_poses

@@ -13,12 +13,7 @@ from typing import Literal
 from sqlalchemy import Connection, text
 
 from service.audit.runs.search import FoundRun, RunSearch, find_runs
-from service.core.equipment.recorded_devices import (
-    RecordedIdentity,
-    RecordedOptics,
-    recorded_identity,
-    recorded_optics,
-)
+from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_identity, recorded_optics
 from service.store.store import Store
 
 InstrumentKind = Literal["camera", "lens", "arm"]

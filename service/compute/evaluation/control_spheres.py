@@ -17,7 +17,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import mm
 
 MOST_WORST_MM = 0.5  # radial error of one control sphere, where the paper's mean over all is 0.35

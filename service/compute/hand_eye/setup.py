@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import LENGTH_WORDS, METRES_PER, deg, mm
 
 ClosedForm = Literal["park", "daniilidis", "tsai", "horaud", "andreff"]
@@ -29,6 +29,7 @@ MIN_VIEWS = 6
 _MIN_ROTATION_DEG = 15.0  # largest rotation between two views
 _MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
 _SUBSETS, _SUBSET_SIZE = 24, 8
+_SPOILT = 2.0  # times larger median deviation: leaving the worst quarter out has not helped
 _FAR_BETTER = 3.0  # times smaller misfit without the stated size
 _USUAL_NOISE_M = 1e-3  # of an arm, to weigh the stated size of the board against the views
 
@@ -174,21 +175,30 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> Robus
     n = len(hands)
     picks = [np.arange(n)]
     picks += [rng.choice(n, min(_SUBSET_SIZE, n), replace=False) for _ in range(_SUBSETS if n > _SUBSET_SIZE else 0)]
-    best: tuple[float, Array] | None = None
+    best: tuple[float, Array, RobustStart] | None = None
     for pick in picks:
         try:
             found = solve_with_scale(hands[pick], boards[pick])
         except (cv2.error, ComputeError):
             continue
+        if found.scale <= 0:  # no board has a negative size
+            continue
         placed = found.placed(hands, boards)
         mm, _ = deviation(placed, mean_pose(placed[pick]))
-        median = float(np.median(mm)) / max(abs(found.scale), 1e-9)  # a board of no size fits everywhere
+        median = float(np.median(mm)) / max(found.scale, 1e-9)  # a board of no size fits everywhere
         if best is None or median < best[0]:
-            best = (median, mm)
+            best = (median, mm, found)
     if best is None:
         raise ComputeError("hand-eye calibration has no answer", remedy="Take views with more rotation")
     keep = np.argsort(best[1], kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
-    return solve_with_scale(hands[keep], boards[keep])
+    try:
+        refined = solve_with_scale(hands[keep], boards[keep])
+    except (cv2.error, ComputeError):
+        return best[2]
+    # Of few views of an arm that errs, the one left out may be the only one that was turned far.
+    mm, _ = deviation(refined.placed(hands, boards), refined.T_base_board)
+    spoilt = refined.scale <= 0 or float(np.median(mm)) / refined.scale > _SPOILT * best[0]
+    return best[2] if spoilt else refined
 
 
 def mean_pose(poses: Array) -> Transform:

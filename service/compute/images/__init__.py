@@ -1,1 +1,1 @@
-"""Photographs: files, folders, quality and resolution."""
+"""Photographs: reading them from files and folders, and developing raw ones."""

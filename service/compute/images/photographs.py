@@ -25,7 +25,7 @@ from service.core.picture_files import (
     kind_of,
     picture_size,
 )
-from service.core.text.counts import counted
+from service.core.text.words import counted
 
 # Kinds of pictures that nothing here decodes, and files that are no pictures.
 _UNREAD = frozenset({

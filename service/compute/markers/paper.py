@@ -25,8 +25,7 @@ from service.compute.markers.records import (
 from service.compute.markers.rough import find_candidates
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.core.text.file_text import file_text
-from service.core.text.json_text import parse_json
+from service.core.text.files import file_text, parse_json
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 

@@ -39,31 +39,21 @@ class DetectionOptions:
     srgb: bool = True  # whether pixel values are sRGB coded
     seed: int = 0  # of RANSAC
     colour_bgr: tuple[float, float, float] | None = None  # of the spheres, 0..255; None: learnt in each image
-    colour_tolerance: float = 0.18  # in chromaticity, around `colour_bgr`; see colours.chromaticity
+    colour_tolerance: float = 0.18  # in chromaticity, around `colour_bgr`; see `chromaticity`
 
 
 DEFAULTS = DetectionOptions()
 
 
 @dataclass(frozen=True)
-class SphereOutline:
-    """The outline of one sphere in one image.
-
-    `centre_px` is the conic's centre in the image as captured; it is not the projection of the sphere's centre, whose
-    direction is `cone.axis`.
+class OutlineEvidence:
+    """Says how well one outline was fitted.
 
     `cone_covariance` (3, 3), rad²: of the displacement of the cone's axis along the first and the second column of
     `cone.frame()` and of the half angle, in this order (true axis ~ axis + frame[:, :2] @ d[:2], true half angle ~
     half angle + d[2]). It includes the noise of the edge points and the systematic error of one outline.
     """
 
-    cone: Cone
-    n_points: int  # L
-    focal_px: tuple[float, float] = field(repr=False)  # of the camera, along x and y
-    principal_px: tuple[float, float] = field(repr=False)
-    centre_px: tuple[float, float]
-    semi_axes_px: tuple[float, float]
-    angle_rad: float  # of the major axis from x
     coverage: float  # share of the outline with accepted edge points, 0..1
     rms_px: float  # of the accepted edge points from the conic
     sigma_px: float  # robust standard deviation of one edge point
@@ -73,6 +63,26 @@ class SphereOutline:
     colour_bgr: tuple[float, float, float]  # median inside, 0..255
     score: float  # 0..1, how much it looks like a sphere
     cone_covariance: Array = field(repr=False)
+
+
+_EVIDENCE = tuple(field.name for field in dataclasses.fields(OutlineEvidence))
+
+
+@dataclass(frozen=True)
+class SphereOutline(OutlineEvidence):
+    """The outline of one sphere in one image.
+
+    `centre_px` is the conic's centre in the image as captured; it is not the projection of the sphere's centre, whose
+    direction is `cone.axis`.
+    """
+
+    cone: Cone
+    n_points: int  # L
+    focal_px: tuple[float, float] = field(repr=False)  # of the camera, along x and y
+    principal_px: tuple[float, float] = field(repr=False)
+    centre_px: tuple[float, float]
+    semi_axes_px: tuple[float, float]
+    angle_rad: float  # of the major axis from x
 
     @cached_property
     def points(self) -> Array:
@@ -98,27 +108,13 @@ class SphereOutline:
         return self.cone.axis * (radius_m / np.sin(self.cone.half_angle_rad))
 
 
-@dataclass(frozen=True, slots=True)
-class OutlineEvidence:
-    """Quality measures of the fit of one outline."""
-
-    coverage: float
-    rms_px: float
-    sigma_px: float
-    n_edges: int
-    systematic_px: float
-    contrast: float
-    colour_bgr: tuple[float, float, float]
-    score: float
-    cone_covariance: Array  # (3, 3), see SphereOutline
-
-
 def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: OutlineEvidence) -> SphereOutline:
     """The outline of a cone, which has `n_points` equidistant points."""
     ellipse = cone_ellipse(cone)
     centre = camera.project(np.array([[*ellipse.centre, 1.0]]))[0]
     f = 0.5 * (camera.fx + camera.fy)
     return SphereOutline(
+        **vars(evidence),
         cone=cone,
         n_points=n_points,
         focal_px=(camera.fx, camera.fy),
@@ -126,19 +122,7 @@ def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: 
         centre_px=(float(centre[0]), float(centre[1])),
         semi_axes_px=(ellipse.semi_major * f, ellipse.semi_minor * f),
         angle_rad=ellipse.angle_rad,
-        coverage=evidence.coverage,
-        rms_px=evidence.rms_px,
-        sigma_px=evidence.sigma_px,
-        n_edges=evidence.n_edges,
-        systematic_px=evidence.systematic_px,
-        contrast=evidence.contrast,
-        colour_bgr=evidence.colour_bgr,
-        score=evidence.score,
-        cone_covariance=evidence.cone_covariance,
     )
-
-
-_EVIDENCE = tuple(field.name for field in dataclasses.fields(OutlineEvidence))
 
 
 def outline_record(outline: SphereOutline) -> dict[str, Any]:

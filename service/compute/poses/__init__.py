@@ -1,1 +1,1 @@
-"""Camera poses: structure from motion, and the files that hold poses."""
+"""Files that hold camera poses: of robots, recordings of ROS 2, COLMAP and others, with the cameras beside them."""

@@ -17,10 +17,10 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import ImageFolder, strict_refusal
 from service.compute.poses.camera_files import finite_numbers, json_object
 from service.compute.sfm import colmap_process as colmap_files
-from service.core.delimited_text import TextTable, is_number, read_table
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
-from service.core.text.file_text import csv_rows, file_bytes
+from service.core.text.delimited_text import TextTable, is_number, read_table
+from service.core.text.files import csv_rows, file_bytes
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass

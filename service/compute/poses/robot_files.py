@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 from service.compute.poses.pose_files import matched_names
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
-from service.core.text.counts import counted
-from service.core.text.file_text import csv_rows, file_text
-from service.core.text.json_text import parse_json
+from service.core.text.files import csv_rows, file_text, parse_json
+from service.core.text.words import counted
 from service.core.units import METRES_PER, LengthUnit
 
 RotationForm = Literal[

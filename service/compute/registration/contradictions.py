@@ -17,7 +17,7 @@ from service.compute.registration.result import RegistrationResult
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import mm
 
 ContradictionKind = Literal[

@@ -28,7 +28,7 @@ _DAMAGED = (ValueError, KeyError, TypeError, IndexError, OSError, EOFError, Runt
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFeatures:
-    """SIFT features of one image (extraction.py says which, if there are too many).
+    """SIFT features of one image (colmap.py says which, if there are too many).
 
     Attributes:
         width, height: of the image as captured, px.

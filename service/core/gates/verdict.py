@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from typing import Literal
 
+from service.core.gates.measure_names import measure_name
 from service.core.protocol.models import Gate, Step
 from service.core.records.events import GatesEvaluated, GateVerdict, Uncertainty
 
@@ -86,10 +87,9 @@ def standing(verdict: GateVerdict, *, accepted: bool = False) -> Standing:
 
 
 def describe(verdict: GateVerdict) -> str:
-    """A figure and its limit in one line: `rms 0.71 px, allowed ≤ 0.5`."""
-    text = (
-        f"{verdict.measure} {figure(verdict)}" if verdict.value is not None else f"{verdict.measure} was not measured"
-    )
+    """Return a figure and its limit in one line: `RMS reprojection error 0.71 px, allowed ≤ 0.5`."""
+    name = measure_name(verdict.measure)
+    text = f"{name} {figure(verdict)}" if verdict.value is not None else f"{name} was not measured"
     return f"{text}, allowed {limits(verdict.minimum, verdict.maximum)}"
 
 
@@ -126,9 +126,9 @@ def _places(apart: float) -> int:
 
 
 def limits(minimum: float | None, maximum: float | None) -> str:
-    """Limits in words: `≥ 0.2 and ≤ 1`, or `= 0`; None means no limit on that side."""
+    """Return limits in words: `≥ 0.2 and ≤ 1`, or `exactly 0`; None means no limit on that side."""
     if minimum is not None and minimum == maximum:
-        return f"= {minimum:g}"
+        return f"exactly {minimum:g}"
     low = "" if minimum is None else f"≥ {minimum:g}"
     high = "" if maximum is None else f"≤ {maximum:g}"
     return " and ".join(limit for limit in (low, high) if limit)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, cast
 
@@ -24,10 +25,52 @@ from service.core.protocol.rules import rule_violations
 from service.core.protocol.step_params import Gives, RepeatedStep, StepParams
 from service.core.records.data_set import DataSetStatement
 from service.core.records.events import Record
-from service.core.recovery.reasons import Reasons
 from service.core.run.lifecycle import RESERVED_STEP_IDS
-from service.core.text.checked_yaml import checked, decoded, did_you_mean, refuse
-from service.core.text.yaml_tree import Plain, YamlProblem, YamlTree, field_name, parse_yaml
+from service.core.text.checked_yaml import (
+    Plain,
+    YamlProblem,
+    YamlTree,
+    checked,
+    decoded,
+    did_you_mean,
+    field_name,
+    parse_yaml,
+    refuse,
+)
+
+_Text = Annotated[str, Field(min_length=3, max_length=200)]
+
+
+class Reasons(Record):
+    """A protocol's preset reasons by action. Free text can always be added, and the full text is recorded."""
+
+    # Offered for a redo.
+    redo: tuple[_Text, ...] = (
+        "Images are blurred or badly lit",
+        "The specimen, the board or a sphere has moved",
+        "Something stood in the view",
+        "A device gave a wrong or incomplete result",
+        "Confirmed by mistake, or before everything was ready",
+    )
+    # Offered for a skip.
+    skip: tuple[_Text, ...] = (
+        "Not part of this acquisition",
+        "A device is out of order",
+        "Done already, outside of this run",
+        "No time is left for it",
+    )
+    # Offered where figures outside their limits are accepted.
+    accept: tuple[_Text, ...] = (
+        "Only just outside; enough for the purpose of this run",
+        "Another figure shows that the result can be used",
+        "It cannot be repeated: the specimen has changed",
+    )
+
+
+def full_reason(preset: str, own: str) -> str:
+    """The reason that is recorded: the chosen preset, then the operator's own words."""
+    return ": ".join(part for part in (preset.strip(), own.strip()) if part)
+
 
 ParamsT = TypeVar("ParamsT", bound=StepParams)
 
@@ -138,7 +181,7 @@ class Gate(Record):
 
 
 class Recovery(Record):
-    """What happens when the work of a step fails (service.core.recovery.policy)."""
+    """What happens when the work of a step fails (service.core.recovery)."""
 
     retries: Annotated[int, Field(ge=0, le=20)] = 2  # after transient device errors without progress in between
     wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
@@ -377,3 +420,19 @@ def protocol_json_schema(params_models: Mapping[str, type[StepParams]]) -> dict[
     whole = create_model("Protocol", __base__=ProtocolFields, __doc__="An orthocapture protocol.", steps=steps)
     schema = TypeAdapter(whole).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def irreversible_warning(protocol: Protocol, step: Step) -> str:
+    """Say in plain words what cannot be undone after this step, and what is judged only when it is too late."""
+    at = protocol.index(step.id)
+    closed = [s.title for s in protocol.steps[:at] if s.photographs_specimen or s.id in step.requires]
+    afterwards = [s.title for s in takewhile(lambda s: not s.begins_confirmed, protocol.steps[at + 1 :]) if s.gates]
+    words = [step.cannot_be_undone or "This step changes the scene for good."]
+    if closed:
+        words.append(f"None of these can be done again: {', '.join(closed)}.")
+    if afterwards:
+        words.append(
+            f"What is judged only afterwards can then be computed again, accepted where the protocol allows it, or "
+            f"left as it is, but no longer be mended by new measurements: {', '.join(afterwards)}."
+        )
+    return " ".join([*words, "Read the figures before you go on."])

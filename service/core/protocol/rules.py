@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import cast
 
-from service.core.text.yaml_tree import FieldPath, Plain
+from service.core.text.checked_yaml import FieldPath, Plain
 
 # Measures that no protocol may allow anybody to accept: outside their limits an image or the evidence itself is
 # invalid, and no judgement can change that. Measure → what is wrong then.

@@ -11,7 +11,7 @@ from service.core.gates.acceptance import describe_accepted
 from service.core.gates.verdict import describe, describe_judged, evaluate_gates
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorVerb, Uncertainty
-from service.core.recovery.ways_on import WayOn, ways_on
+from service.core.recovery import WayOn, ways_on
 from service.core.run.actions import (
     allowed_actions,
     needs_leave,
@@ -20,10 +20,9 @@ from service.core.run.actions import (
     redoable_steps,
     unmet_requirements,
 )
-from service.core.run.connections import lost_arms
 from service.core.run.fold import advance, fold, initial_state
-from service.core.run.state import Deviation, JobState, Lapse, Note, RunState, StepState, Superseded
-from service.core.text.clock_time import time_utc
+from service.core.run.state import Deviation, JobState, Lapse, Note, RunState, StepState, Superseded, lost_arms
+from service.core.text.words import time_utc
 
 __all__ = [
     "Accept",

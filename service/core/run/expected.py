@@ -1,4 +1,4 @@
-"""How long the work of a step usually takes, until when nobody is needed, and from when on that is not normal."""
+"""What is said of a step that works by itself: how long it takes, when that is not normal, what it tries again."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from statistics import median
 
+from service.core.errors import what_of
 from service.core.protocol.models import Protocol, Step
-from service.core.recovery.ways_on import planned_views, view_s
+from service.core.recovery import planned_views, view_s
 from service.core.run.actions import needs_leave
-from service.core.run.state import RunState, StepState
+from service.core.run.state import FailedTries, RunState, StepState
+from service.core.text.words import time_utc
 
 _TOO_LONG = 1.5  # times what is usual, and longer than ever before
 _SHORT_S = 20.0  # nobody leaves for less
@@ -135,3 +137,42 @@ def duration(seconds: float) -> str:
         return f"{max(round(seconds / 5) * 5, 5)} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+_TIMES = ("never", "once", "twice")
+
+
+def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str] = time_utc) -> str:
+    """`b001 failed twice: no file within 46 s; third try at 20:41:07 UTC`, while the run tries again by itself.
+
+    "" where nothing has failed, or where a person decides whether there is another try.
+
+    Args:
+        protocol: of the run.
+        state: of the run.
+        clock: a recorded time in words.
+    """
+    tries, now = state.step.tries, state.step
+    if tries is None or state.status != "active" or needs_leave(protocol, state):
+        return ""
+    if now.phase == "recovering":
+        if now.failure is None or now.failure.recovery != "retry":
+            return ""
+        wait = timedelta(seconds=protocol.step(now.step).recovery.wait_s)
+        begins_utc = (datetime.fromisoformat(now.failure.at_utc or tries.at_utc) + wait).isoformat()
+        return f"{failed_words(tries)}; {_ordinal(tries.times + 1)} try at {clock(begins_utc)}, by itself"
+    if now.phase != "running":
+        return ""
+    since_utc = max(tries.at_utc, now.work_began_utc)
+    return f"{failed_words(tries)}; {_ordinal(tries.times + 1)} try since {clock(since_utc)}, by itself"
+
+
+def failed_words(tries: FailedTries) -> str:
+    """`b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
+    times = _TIMES[tries.times] if tries.times < len(_TIMES) else f"{tries.times} times"
+    return f"{tries.what or 'The step'} failed {times}: {what_of(tries.message)}"
+
+
+def _ordinal(number: int) -> str:
+    return _ORDINALS[number - 1] if number <= len(_ORDINALS) else f"{number}th"

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from service.core.gates.acceptance import describe_accepted, failed_gates
 from service.core.protocol.models import Protocol
 from service.core.records.entered import NoteTaken
 from service.core.records.events import (
@@ -43,37 +44,134 @@ from service.core.records.events import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.core.run.effects.arms import device_opened, device_trouble, leave_lapsed, robot_seen
-from service.core.run.effects.jobs import job_ended, job_enqueued
-from service.core.run.effects.people import (
+from service.core.run.actions import recorded_refusal
+from service.core.run.effects import (
     action_refused,
+    all_seen,
+    capture_asked,
     control_taken,
+    device_opened,
+    device_trouble,
+    files_kept,
+    gates_evaluated,
+    impossible,
     item_ticked,
+    job_ended,
+    job_enqueued,
+    leave_lapsed,
     record_corrected,
     region_drawn,
-    run_released,
-)
-from service.core.run.effects.place import impossible
-from service.core.run.effects.runs import (
-    files_kept,
+    robot_seen,
     run_aborted,
     run_completed,
+    run_released,
     run_started,
     session_started,
-)
-from service.core.run.effects.steps import (
-    gates_evaluated,
     step_failed,
     step_measured,
     step_note,
     step_passed,
     step_retried,
     step_started,
+    view_added,
+    viewpoint_failed,
 )
-from service.core.run.effects.views import capture_asked, view_added, viewpoint_failed
-from service.core.run.lifecycle import lifecycle
-from service.core.run.operator_transitions import apply_action
-from service.core.run.state import RunState, StepState
+from service.core.run.lifecycle import lifecycle, redo
+from service.core.run.state import AcceptedDeviation, DeviationKind, Leave, RunState, StepState
+from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede, wait, wait_no_more
+
+
+def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return per verb
+    """The state after an action; an action that is not allowed is listed as refused and has no other effect."""
+    refusal = recorded_refusal(protocol, state, p, event.actor)
+    if refusal is not None:
+        return deviate(state, event, "refused", p.step, f"{p.action} had no effect: {refusal}")
+    state = replace(state, people=state.people | {event.actor})
+    if p.automatic:
+        state = deviate(
+            state, event, "automatic", state.current, f"{p.action} given automatically on a simulated rig"
+        )
+    match p.action:
+        case "confirm":
+            return _confirm(_let_move(protocol, state, event), event, p)
+        case "sign":
+            return change(state, state.current, signed=True, signed_by=event.actor)
+        case "accept":
+            accepted = AcceptedDeviation(
+                event.seq, event.actor, p.role, p.identified, p.reason, failed_gates(state.step)
+            )
+            state = deviate(state, event, "gate_accepted", state.current, describe_accepted(accepted))
+            return go(protocol, state, "gates_accepted", accepted=accepted)
+        case "skip":
+            overridden = bool(state.step.verdicts) and not state.step.gates_passed
+            kind: DeviationKind = "gate_overridden" if overridden else "skip"
+            state = deviate(state, event, kind, state.current, p.reason)
+            return pass_on(protocol, go(protocol, state, "skip", skipped=True, ended_utc=event.at_utc))
+        case "abort":
+            return replace(go(protocol, state, "abort"), stop_reason=p.reason or f"aborted by {event.actor}")
+        case "pause":
+            return go(protocol, wait(protocol, state, event), "pause")
+        case "resume":
+            return go(protocol, _let_move(protocol, state, event), "resume")
+        case "redo" if p.viewpoint is not None:
+            return replace(_redo_viewpoint(protocol, state, event, p.viewpoint, p.reason), last_redo_seq=event.seq)
+        case "redo":
+            target = p.step or state.current
+            return replace(_redo_step(protocol, state, event, target, p.reason), last_redo_seq=event.seq)
+
+
+def _let_move(protocol: Protocol, state: RunState, event: Event) -> RunState:
+    state = replace(state, restarted=False, lapse=None, leave=Leave(event.seq, event.actor))
+    state = wait_no_more(change(state, state.current, tries=None), event)
+    return all_seen(state, event) if protocol.step(state.current).moves_robot else state
+
+
+def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:
+    ticked = p.checklist or state.step.ticked  # items left open before may be ticked now
+    there = change(state, state.current, confirmed_by=event.actor, ticked=ticked)
+    match state.phase:
+        case "running":  # after a restart: the work goes on
+            return there
+        case "recovering":
+            return change(there, state.current, retry_granted=True)
+        case _:
+            return change(there, state.current, confirmed=True)
+
+
+def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, reason: str) -> RunState:
+    """Go back to `target`: it and every later step start afresh."""
+    for step in protocol.step_ids[protocol.index(target) :]:
+        now = state.steps[step]
+        if now.phase == "pending":
+            continue
+        began = bool(now.started_utc)
+        if step == target:
+            state = deviate(state, event, "redo", step, reason)
+        elif began or now.skipped:
+            state = deviate(state, event, "reset_by_redo", step, f"reset because {target} is done again: {reason}")
+        if began or now.skipped:
+            state = supersede(state, event, step, reason, None, now.captured)
+        # Count up even if nothing had begun, so that an outcome recorded later is known to be void.
+        state = replace(state, steps={**state.steps, step: StepState(step, attempt=now.attempt + 1)})
+    return go(protocol, state, redo(target))
+
+
+def _redo_viewpoint(protocol: Protocol, state: RunState, event: Event, viewpoint: str, reason: str) -> RunState:
+    """Forget one viewpoint; a step that had finished its work becomes ready again and keeps the others."""
+    now = state.step
+    state = deviate(state, event, "redo_viewpoint", state.current, f"{viewpoint}: {reason}")
+    if viewpoint in now.captured:
+        state = supersede(state, event, state.current, reason, viewpoint, {viewpoint: now.captured[viewpoint]})
+    changes: dict[str, Any] = {
+        "captured": {name: seq for name, seq in now.captured.items() if name != viewpoint},
+        "viewpoint_failures": {name: n for name, n in now.viewpoint_failures.items() if name != viewpoint},
+        "skipped_viewpoints": tuple(name for name in now.skipped_viewpoints if name != viewpoint),
+    }
+    if now.phase in ("running", "ready"):
+        return change(state, state.current, **changes)
+    changes |= {**UNMEASURED, "attempt": now.attempt + 1, "skipped": False, "retry_granted": False}
+    changes |= {"confirmed": False, "ticked": (), "passed_sha256": "", "passed_seq": 0, "ended_utc": ""}
+    return go(protocol, change(state, state.current, **changes), redo(state.current))
 
 
 def initial_state(protocol: Protocol) -> RunState:

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from service.core.protocol.models import Protocol
+from service.core.records.base import seconds_between
 from service.core.records.events import Event
-from service.core.records.moments import seconds_between
 from service.core.run.lifecycle import ABORTED, COMPLETED, lifecycle
 from service.core.run.state import Deviation, DeviationKind, RunState, Superseded
 

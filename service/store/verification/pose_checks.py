@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from service.core.equipment.recorded_devices import recorded_report
+from service.core.recorded_devices import recorded_report
 from service.core.units import deg, mm
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class PoseFacts:
 
     def open(self, device: str, report: object) -> None:
         """Add a device_opened event: the device's name in rig.yaml, and its DeviceReport as plain data."""
-        from service.core.arms.known import known_arm  # noqa: PLC0415 - searches for plug-ins
+        from service.core.arms.model import known_arm  # noqa: PLC0415 - searches for plug-ins
 
         identity = recorded_report(report).identity
         if identity.kind == "robot":
@@ -67,7 +67,7 @@ class PoseFacts:
             return
         import numpy as np  # noqa: PLC0415 - which few verifications need
 
-        from service.core.arms.flange import fits, flange_pose, pose_gap  # noqa: PLC0415
+        from service.core.arms.model import fits, flange_pose, pose_gap  # noqa: PLC0415
 
         joints, pose = np.array(view.joints_rad, dtype=float), np.array(view.T_base_flange, dtype=float)
         gaps = [pose_gap(flange_pose(a, joints), pose) for a in self._arms.values() if a and a.axes == len(joints)]

@@ -21,9 +21,8 @@ from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import rows
 from service.audit.record.rows import EventRow
 from service.audit.runs.search import RunSearch, find_runs
-from service.core.equipment.camera_bodies import CameraBodies
-from service.core.equipment.recorded_devices import RecordedIdentity
 from service.core.errors import OrthocaptureError
+from service.core.recorded_devices import CameraBodies, RecordedIdentity
 from service.people.approvals import Approval, approvals, difference
 from service.run_record import results_to_come
 from service.store.records import SITE
@@ -34,7 +33,7 @@ from service.web.page.rendering import TEMPLATES, render
 from service.web.security import requires
 
 if TYPE_CHECKING:
-    from service.steps.poses.time_left import PendingResult
+    from service.steps.due_jobs import PendingResult
 
 
 @dataclass(frozen=True, slots=True)

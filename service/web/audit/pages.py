@@ -15,7 +15,8 @@ from service.audit.overview.digest import Digest
 from service.audit.overview.findings import correct
 from service.audit.overview.signatures import signatures
 from service.audit.record import rows, search
-from service.core.equipment.clocks import clock_offset_words, clock_readings
+from service.core.clocks import clock_offset_words, clock_readings
+from service.core.gates.measure_names import measure_name
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.dataset.registrations import evaluated, own_registration
@@ -191,6 +192,7 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
         pictures=pictures,
         page=page,
         pages=pages,
+        measure_name=measure_name,
         href=lambda number: link(f"{frame.base}/corrections", {"page": number}),
     )
 

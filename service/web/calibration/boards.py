@@ -17,22 +17,22 @@ from service.compute.board.board import Board
 from service.compute.board.next_poses import SuggestedPose, suggest_board_poses
 from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.estimate import HandEyeAnswer
-from service.core.arms.known import known_arm
+from service.core.arms.model import known_arm
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, Transform, inverse
 from service.core.protocol.models import CalibrationBoard as BoardSection
 from service.core.records.events import ViewpointCaptured
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import deg, metres, mm
 from service.jobs.calibration.records import ArmAnswer, HandEye
 from service.jobs.records import Camera
 from service.rig import Rig
 from service.run_record import RunRecord
-from service.steps.board.plan import describe_prediction
-from service.steps.capture.plan.preview import preview_board_poses
+from service.steps.board_plan import describe_prediction
 from service.steps.context import StationLayout
-from service.steps.kinds.captures.calibration import Params
+from service.steps.kinds.calibration import Params
 from service.steps.notes import BOARD_POSES, board_plans
+from service.steps.plan_preview import preview_board_poses
 from service.web.record.images import recorded_rig_section
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import station_of

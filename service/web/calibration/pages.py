@@ -9,7 +9,8 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
 from service.core.errors import IllegalTransitionError
-from service.core.gates.dependence import AcceptedGate, depends_on
+from service.core.gates.acceptance import AcceptedGate, depends_on
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.records.events import Event, ViewpointCaptured
 from service.run_record import RunRecord
@@ -27,7 +28,7 @@ from service.web.calibration.view import (
 )
 from service.web.page.charts import DotPlot
 from service.web.page.rendering import render
-from service.web.page.run_frame import RunFrame, gate_word, limit, measure_name, run_frame
+from service.web.page.run_frame import RunFrame, gate_word, limit, run_frame
 from service.web.record.images import further_cameras_of, recorded_rig_section
 from service.web.security import requires
 from service.web.site import CurrentSite, RunId, Site

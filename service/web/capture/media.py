@@ -19,8 +19,8 @@ from pydantic import BaseModel, Field
 from sqlalchemy import select
 
 from service.core.errors import OrthocaptureError
+from service.core.records.base import age_s
 from service.core.records.events import ArtefactRef
-from service.core.records.moments import age_s
 from service.monitor.snapshot import ask_for_frames, frame_path
 from service.notes import NOTE_PHOTOGRAPH
 from service.run_record import RunRecord

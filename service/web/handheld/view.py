@@ -9,9 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from service.core.equipment.recorded_devices import recorded_report
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, Step
+from service.core.recorded_devices import recorded_report
 from service.core.records.events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
 from service.jobs.capture import hand_board, hand_view
@@ -19,8 +20,8 @@ from service.jobs.looks import image_of
 from service.jobs.records import Matrix
 from service.jobs.surfaces import coverage_points
 from service.run_record import RunRecord
-from service.steps.handheld.guide import failure_words
-from service.web.page.run_frame import limit, measure_name
+from service.steps.handheld import failure_words
+from service.web.page.run_frame import limit
 from service.web.record.images import captures_of
 
 SIZE = 480.0  # of the drawing, which is square

@@ -14,18 +14,18 @@ from pydantic import BaseModel, Field
 from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
 from service.audit.runs.search import RESULT_WORDS, RESULTS, RunSearch, find_runs
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.protocol.irreversible import irreversible_warning
-from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
+from service.core.gates.measure_names import measure_name
+from service.core.protocol.models import LoadedProtocol, Protocol, irreversible_warning, load_protocol
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.core.records.events import RunStarted
-from service.core.run.connections import lost_arms
+from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.disk_space import forecast_of
 from service.store.records import RunRow
 from service.web.page.rendering import render
 from service.web.page.robot_banner import robot_banner
-from service.web.page.run_frame import driven_frames, limit, measure_name, run_frame, run_standing
+from service.web.page.run_frame import driven_frames, limit, run_frame, run_standing
 from service.web.security import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -290,7 +290,15 @@ def compare_page(
     comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]
     missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
-    return render(request, "home/compare.html.j2", c=comparison, chosen=chosen, offered=offered, missing=missing)
+    return render(
+        request,
+        "home/compare.html.j2",
+        c=comparison,
+        chosen=chosen,
+        offered=offered,
+        missing=missing,
+        measure_name=measure_name,
+    )
 
 
 def _run(site: Site, run_id: str) -> ComparedRun:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Literal
 
-from service.core.run.connections import Loss, connected_arms, lost_arms
-from service.core.run.state import RunState
-from service.core.text.clock_time import time_here
+from service.core.run.state import Loss, RunState, connected_arms, lost_arms
+from service.core.text.words import time_here
 from service.monitor.snapshot import STALE_S, Snapshot
 
 Tone = Literal["moving", "standing", "paused", "unknown", "stop"]

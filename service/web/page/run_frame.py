@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.errors import OrthocaptureError
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing as GateStanding
 from service.core.gates.verdict import figure, standing
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import GateVerdict, RunStarted
 from service.core.records.import_list import imported_sentence
-from service.core.recovery.ways_on import WayOn, planned_sets, planned_views
-from service.core.run.connections import lost_arms
+from service.core.recovery import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator, Decision, decide
+from service.core.run.expected import tries_words
 from service.core.run.noted import Mending
-from service.core.run.state import RunState, StepState
-from service.core.run.tries import tries_words
-from service.core.text.clock_time import time_here
+from service.core.run.state import RunState, StepState, lost_arms
+from service.core.text.words import time_here
 from service.monitor.snapshot import STOPS, RobotPhase, Standing, read_snapshot
 from service.people.control import Control
 from service.run_record import RunRecord
@@ -28,9 +28,6 @@ from service.store.durable_effects import moment_of
 from service.web.page.robot_banner import NOT_THE_STOP, Banner, robot_banner
 from service.web.site import Site
 
-_ACRONYMS = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "five": "Five", "px": "px"}
-_UNITS = frozenset({"px", "mm", "deg", "min", "m", "s", "rad"})
-
 
 def drawing_of(step: Step) -> str:
     """Name of the drawing that shows the step, "" for none: the protocol's own choice, else that of its kind."""
@@ -38,17 +35,10 @@ def drawing_of(step: Step) -> str:
     return step.drawing or (kind.drawing if kind is not None else "")
 
 
-def measure_name(measure: str) -> str:
-    """`five_fold_rms_px` → `Five fold RMS`: the unit stands beside the number."""
-    parts = measure.split("_")
-    while len(parts) > 1 and parts[-1] in _UNITS:
-        parts.pop()
-    words = " ".join(_ACRONYMS.get(part, part) for part in parts)
-    return words[:1].upper() + words[1:]
-
-
 def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
-    """`at least 0.2 and at most 1 mm`."""
+    """Return the limits in words: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
+    if minimum is not None and minimum == maximum:
+        return f"exactly {minimum:g} {unit}".rstrip()
     low = "" if minimum is None else f"at least {minimum:g}"
     high = "" if maximum is None else f"at most {maximum:g}"
     return f"{' and '.join(text for text in (low, high) if text) or 'no limit'} {unit}".rstrip()

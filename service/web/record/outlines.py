@@ -16,7 +16,7 @@ from service.compute.markers.records import SphereOutline, outline_from_record
 from service.compute.poses.camera_files import read_camera_json
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
-from service.core.jobs.references import jobs_of
+from service.core.jobs import jobs_of
 from service.core.protocol.step_params import Gives
 from service.core.units import metres
 from service.dataset.further_cameras import further_pose

@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse
 from pydantic import BaseModel, Field
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
-from service.core.protocol.models import load_protocol
+from service.core.protocol.models import full_reason, load_protocol
 from service.core.records.entered import NoteTaken, about_run, require_specimen
 from service.core.records.events import (
     ActionRefused,
@@ -27,11 +27,9 @@ from service.core.records.events import (
     SessionStarted,
     StepNote,
 )
-from service.core.recovery.reasons import full_reason
 from service.core.run.actions import redo_moves, refuse
-from service.core.run.connections import lost_arms
-from service.core.run.state import RunState
-from service.core.text.reasons import REASON_CHARACTERS, reason_of
+from service.core.run.state import RunState, lost_arms
+from service.core.text.words import REASON_CHARACTERS, reason_of
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
 from service.people.control import Control

@@ -18,12 +18,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
 
 from service.core.errors import DataError, OrthocaptureError
-from service.core.gates.dependence import AcceptedGate, accepted_gates
+from service.core.gates.acceptance import AcceptedGate, accepted_gates
 from service.core.gates.release import loses_release
-from service.core.protocol.models import Step
+from service.core.protocol.models import Reasons, Step
 from service.core.records.entered import NoteTaken, about_rows
 from service.core.records.events import ArtefactRef, ControlTaken, Event, RunStarted
-from service.core.recovery.reasons import Reasons
 from service.dataset.registrations import evaluated, shared_adjustment_note
 from service.jobs.registration.evaluate import Row
 from service.monitor.snapshot import STALE_S, read_snapshot

@@ -8,19 +8,20 @@ from itertools import pairwise
 from statistics import median
 from typing import Protocol as Interface
 
-from service.core.equipment.clocks import ClockReading
-from service.core.equipment.disk_space import Forecast, size_words
-from service.core.gates.dependence import AcceptedGate
+from service.core.clocks import ClockReading
+from service.core.disk_space import Forecast, size_words
+from service.core.gates.acceptance import AcceptedGate
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import Event, GateVerdict, OperatorAction, OperatorVerb, RecordedView, SessionStarted
-from service.core.recovery.ways_on import planned_views
+from service.core.recovery import planned_views
 from service.core.run.expected import duration
 from service.core.run.state import Deviation, RunState, StepState
 from service.jobs.registration.evaluate import Row
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
-from service.web.page.run_frame import gate_word, limit, measure_name
+from service.web.page.run_frame import gate_word, limit
 
 _GIB = 2.0**30
 _BAR_LIMIT = 75.0  # where along a bar its limit stands, in %

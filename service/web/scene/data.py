@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.compute.evaluation.error_budget import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
-from service.core.text.counts import counted
+from service.core.text.words import counted
 from service.core.units import deg, metres, mm
 from service.dataset.further_cameras import KnownFurtherCamera, further_poses
 from service.dataset.registrations import registrations

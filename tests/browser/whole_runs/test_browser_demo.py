@@ -17,7 +17,7 @@ import yaml
 from playwright.sync_api import Browser, Locator, Page, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
-from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_people, screen, served
+from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_people, follow, screen, served
 from tests.support.processes.waiting import until
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig
@@ -203,10 +203,10 @@ def test_the_auditor_reads_everything_and_changes_nothing(server: Served, browse
         page = desk.page
         desk.sign_in("otto")
         desk.go("/audit")
-        page.get_by_role("main").get_by_role("link", name=run).click()
+        follow(page.get_by_role("main").get_by_role("link", name=run))
         expect(page.get_by_role("heading", name="Deviations")).to_be_visible(timeout=ANSWER_MS)
         for name in ("Timeline", "Artefacts", "Provenance", "Corrections", "Signatures", "Devices and clocks"):
-            page.get_by_role("navigation", name="Audit of this run").get_by_role("link", name=name).click()
+            follow(page.get_by_role("navigation", name="Audit of this run").get_by_role("link", name=name))
             expect(page.get_by_role("heading", level=1)).to_be_visible(timeout=ANSWER_MS)
         desk.go(f"/audit/runs/{run}/signatures")
         expect(page.get_by_text("Tina Example").or_(page.get_by_text("tina")).first).to_be_visible(timeout=ANSWER_MS)

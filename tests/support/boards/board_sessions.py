@@ -17,14 +17,14 @@ from service.compute.board.board import Board
 from service.compute.board.design import CalibrationTargets
 from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.reprojection import BoardCorners
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection
-from service.steps.board.plan import Planner, nominal_board, nominal_camera, preview_board
-from service.steps.board.poses import BoardPoses
-from service.steps.capture.plan.planning import usual_posture
-from service.steps.capture.plan.viewpoints import ViewpointSet, flange_target, plan_viewpoints
+from service.steps.board_plan import Planner, nominal_board, nominal_camera, preview_board
+from service.steps.board_poses import BoardPoses
 from service.steps.context import StationLayout
+from service.steps.planning import usual_posture
+from service.steps.viewpoints import ViewpointSet, flange_target, plan_viewpoints
 from simulators.scene.arm import ARM_MODEL
 from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 from simulators.ur_controller.kinematics import inverse as joints_for

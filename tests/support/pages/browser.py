@@ -281,6 +281,12 @@ def scripts_held_back(page: Page) -> Generator[Callable[[], None]]:
     yield come
 
 
+def follow(link: Locator) -> None:
+    """Click a link, and wait until the page behind it has loaded, its scripts included."""
+    with link.page.expect_navigation():
+        link.click()
+
+
 def accessibility_faults(page: Page) -> list[str]:
     """What axe reports against WCAG 2.2 AA: the rule and the place."""
     if not page.evaluate("'axe' in window"):  # half a megabyte

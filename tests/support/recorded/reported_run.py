@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from service.core.arms.flange import flange_pose
-from service.core.arms.known import arm_model
+from service.core.arms.model import arm_model, flange_pose
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (

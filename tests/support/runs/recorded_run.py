@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.core.gates.verdict import evaluate_gates
-from service.core.jobs.references import Reference
+from service.core.jobs import Reference
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import (
     ArtefactRef,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from service.core.records.base import ArtefactRef, Record
 from service.core.records.entered import NoteTaken, RunAbout
 from service.core.records.events.envelope import PAYLOAD, Event, Payload
-from service.core.records.events.jobs import JobEnqueued, JobFailed, JobFinished
 from service.core.records.events.operator import (
     ActionRefused,
     ControlTaken,
@@ -20,14 +19,36 @@ from service.core.records.events.operator import (
     RunReleased,
 )
 from service.core.records.events.run import (
+    CaptureAsked,
+    ComputedBy,
     DeviceOpened,
     DeviceTrouble,
+    FilesKept,
+    FurtherExposure,
+    GatesEvaluated,
+    GateVerdict,
     HostClock,
+    JobEnqueued,
+    JobFailed,
+    JobFinished,
     LeaveLapsed,
+    Matrix4,
+    RecordedView,
     RunAborted,
     RunCompleted,
     RunStarted,
     SessionStarted,
+    StepFailed,
+    StepMeasured,
+    StepNote,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+    Uncertainty,
+    ViewHeld,
+    ViewImported,
+    ViewpointCaptured,
+    ViewpointFailed,
 )
 from service.core.records.events.site import (
     AccountChanged,
@@ -43,29 +64,6 @@ from service.core.records.events.site import (
     SignInRecorded,
     SiteOpened,
     TimeStampKept,
-)
-from service.core.records.events.steps import (
-    ComputedBy,
-    FilesKept,
-    GatesEvaluated,
-    GateVerdict,
-    StepFailed,
-    StepMeasured,
-    StepNote,
-    StepPassed,
-    StepRetried,
-    StepStarted,
-    Uncertainty,
-)
-from service.core.records.events.views import (
-    CaptureAsked,
-    FurtherExposure,
-    Matrix4,
-    RecordedView,
-    ViewHeld,
-    ViewImported,
-    ViewpointCaptured,
-    ViewpointFailed,
 )
 
 __all__ = [

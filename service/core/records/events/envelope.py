@@ -8,7 +8,6 @@ from pydantic import Field, TypeAdapter
 
 from service.core.records.base import Record
 from service.core.records.entered import NoteTaken
-from service.core.records.events.jobs import JobEnqueued, JobFailed, JobFinished
 from service.core.records.events.operator import (
     ActionRefused,
     ControlTaken,
@@ -21,13 +20,29 @@ from service.core.records.events.operator import (
     RunReleased,
 )
 from service.core.records.events.run import (
+    CaptureAsked,
     DeviceOpened,
     DeviceTrouble,
+    FilesKept,
+    GatesEvaluated,
+    JobEnqueued,
+    JobFailed,
+    JobFinished,
     LeaveLapsed,
     RunAborted,
     RunCompleted,
     RunStarted,
     SessionStarted,
+    StepFailed,
+    StepMeasured,
+    StepNote,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+    ViewHeld,
+    ViewImported,
+    ViewpointCaptured,
+    ViewpointFailed,
 )
 from service.core.records.events.site import (
     AccountChanged,
@@ -44,17 +59,6 @@ from service.core.records.events.site import (
     SiteOpened,
     TimeStampKept,
 )
-from service.core.records.events.steps import (
-    FilesKept,
-    GatesEvaluated,
-    StepFailed,
-    StepMeasured,
-    StepNote,
-    StepPassed,
-    StepRetried,
-    StepStarted,
-)
-from service.core.records.events.views import CaptureAsked, ViewHeld, ViewImported, ViewpointCaptured, ViewpointFailed
 
 Payload = Annotated[
     OperatorAction

@@ -1,8 +1,10 @@
-"""Events of a run as a whole: its start, its sessions and devices, its end."""
+"""What happens in a run: it begins, devices open, steps work and are judged, images and answers arrive, it ends."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
+
+from pydantic import Field
 
 from service.core.records.base import ArtefactRef, Record
 from service.core.records.entered import RunAbout
@@ -88,3 +90,247 @@ class RunAborted(Record):
 
     kind: Literal["run_aborted"] = "run_aborted"
     reason: str
+
+
+class StepStarted(Record):
+    """The work of a step begins (ready → running)."""
+
+    kind: Literal["step_started"] = "step_started"
+    step: str
+    attempt: int
+
+
+class StepNote(Record):
+    """Something a step found out that belongs in the record (station entered, timer started, …)."""
+
+    kind: Literal["step_note"] = "step_note"
+    step: str
+    attempt: int
+    note: str
+    data: dict[str, Any] = Field(default_factory=dict)
+
+
+class FilesKept(Record):
+    """Files that arrived from a scanner or CT, or were decoded from such files, and are now in the evidence."""
+
+    kind: Literal["files_kept"] = "files_kept"
+    step: str
+    attempt: int
+    device: str
+    note: str
+    artefacts: tuple[ArtefactRef, ...]
+
+
+class Uncertainty(Record):
+    """How well a measured number is known, in the number's own unit."""
+
+    sigma: float  # standard deviation
+    lower: float  # the true value is above this with 99 % confidence (one-sided)
+    upper: float  # the true value is below this with 99 % confidence (one-sided)
+
+
+class ComputedBy(Record):
+    """A job whose measures, and whose answer, a step gave as its own."""
+
+    job: str
+    prefix: str = ""  # what the step put before the names of the job's measures: `colmap_`
+
+
+class StepMeasured(Record):
+    """The work of a step is done: its numbers, before any gate (running → checking)."""
+
+    kind: Literal["step_measured"] = "step_measured"
+    step: str
+    attempt: int
+    measures: dict[str, float]
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: dict[str, Any] = Field(default_factory=dict)  # the step kind's Result as plain data
+    uncertainties: dict[str, Uncertainty] = Field(default_factory=dict)  # of those measures that state one
+    computed_by: tuple[ComputedBy, ...] | None = None  # None: recorded before events named the jobs
+
+
+class StepFailed(Record):
+    """The work of a step ended with an error; recovery says what happens next (running → recovering)."""
+
+    kind: Literal["step_failed"] = "step_failed"
+    step: str
+    attempt: int
+    error: str
+    message: str
+    recovery: Literal["retry", "ask", "abort"]
+
+
+class StepRetried(Record):
+    """A step is tried again, by the recovery policy or on the operator's confirmation (recovering → running)."""
+
+    kind: Literal["step_retried"] = "step_retried"
+    step: str
+    attempt: int
+    why: str
+
+
+class GateVerdict(Record):
+    """One measured number against its limit."""
+
+    measure: str
+    value: float | None  # None if the step did not measure it, which fails the gate
+    minimum: float | None
+    maximum: float | None
+    unit: str
+    passed: bool
+    sigma: float | None = None  # of the value, where it states its uncertainty
+    lower: float | None = None
+    upper: float | None = None
+    undecided: bool = False  # a limit lies between the bounds; `passed` is then false
+
+
+class GatesEvaluated(Record):
+    """All gates of a step (checking → awaiting_operator or recovering)."""
+
+    kind: Literal["gates_evaluated"] = "gates_evaluated"
+    step: str
+    attempt: int
+    verdicts: tuple[GateVerdict, ...]
+    passed: bool
+
+
+class StepPassed(Record):
+    """The step is done and the next one becomes ready (awaiting_operator → passed)."""
+
+    kind: Literal["step_passed"] = "step_passed"
+    step: str
+    attempt: int
+
+
+Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metres
+
+
+class RecordedView(Record):
+    """What the record holds for every photograph, whether taken by robot, by hand or imported."""
+
+    step: str
+    attempt: int
+    viewpoint: str  # name of the view, unique within its step
+    station: str  # of the robot; "" without one
+    artefacts: tuple[ArtefactRef, ...]  # the photograph first
+    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
+    verdicts: dict[str, bool] = Field(default_factory=dict)  # still, settings, sharp …
+
+
+class FurtherExposure(Record):
+    """What a further camera exposed at the same viewpoint, after the first one."""
+
+    device: str  # name in rig.yaml
+    mounted: Literal["fixed", "rigid"]  # in the room, or beside the first camera
+    artefacts: tuple[ArtefactRef, ...]  # the photograph first
+    calibration: ArtefactRef  # file with the intrinsics of this camera
+    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    trigger_monotonic_s: float
+    arrival_monotonic_s: float
+    verdicts: dict[str, bool] = Field(default_factory=dict[str, bool])  # settings; the view's own include them
+
+
+class ViewpointCaptured(RecordedView):
+    """One complete exposure of a camera carried by a robot: files, pose, settings, environment."""
+
+    kind: Literal["viewpoint_captured"] = "viewpoint_captured"
+    T_base_flange: Matrix4  # mean over the exposure
+    pose_sigma_m: float  # standard deviation of the position over the exposure
+    pose_sigma_rad: float  # of the rotation vector; early runs recorded that of its length, which is smaller
+    joints_rad: tuple[float, ...]
+    pose_samples: int
+    trigger_monotonic_s: float
+    arrival_monotonic_s: float
+    controller_time_s: float
+    clock_offset_s: float  # controller time minus host monotonic
+    further: tuple[FurtherExposure, ...] = ()  # of the rig's further cameras that exposed here
+    ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
+    T_flange_tcp: Matrix4 | None = None  # the tool that the controller held; None: it did not tell
+    payload_kg: float | None = None  # that the controller reckoned with
+    payload_centre_m: tuple[float, float, float] | None = None  # its centre of gravity in the flange frame
+
+
+class ViewImported(RecordedView):
+    """One photograph that was captured earlier. The record proves only when and by whom it was imported."""
+
+    kind: Literal["view_imported"] = "view_imported"
+    imported_by: str
+    file_name: str  # within the imported folder
+    modified_utc: str  # modification time in the file system
+
+
+class ViewHeld(RecordedView):
+    """One exposure of a hand-held camera. The worker estimates its pose from the image (its answer to the job)."""
+
+    kind: Literal["view_held"] = "view_held"
+    # `camera`: its own button; `screen`, `pedal`: the software released it. `elsewhere`: the image was found as a
+    # file, and only what the file says is known.
+    released_by: Literal["camera", "screen", "pedal", "elsewhere"]
+    found_at: str = ""  # path of that file
+    arrival_monotonic_s: float
+
+
+class CaptureAsked(Record):
+    """A person at a screen asks the running step to release the shutter, or to finish with the images it has."""
+
+    kind: Literal["capture_asked"] = "capture_asked"
+    step: str
+    attempt: int
+    what: Literal["release", "finish"]
+
+
+class ViewpointFailed(Record):
+    """A viewpoint could not be captured this time."""
+
+    kind: Literal["viewpoint_failed"] = "viewpoint_failed"
+    step: str
+    attempt: int
+    viewpoint: str
+    error: str
+    message: str
+    skipped: bool = False  # given up, and the step continues with the next one (a deviation)
+
+
+class JobEnqueued(Record):
+    """Work for the registration worker."""
+
+    kind: Literal["job_enqueued"] = "job_enqueued"
+    job: str
+    job_kind: str
+    step: str
+    attempt: int
+    idempotency_key: str
+    arguments: dict[str, Any]
+    priority: int = 1  # smaller goes first: see service.core.run.state
+    version: int = 1  # of the computation (JobKind.version): 1 copies earlier results, later ones refer to them
+
+
+class JobFinished(Record):
+    """The worker's result."""
+
+    kind: Literal["job_finished"] = "job_finished"
+    job: str
+    job_kind: str
+    step: str
+    attempt: int
+    worker: str
+    measures: dict[str, float]
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: dict[str, Any] = Field(default_factory=dict)
+    duration_s: float
+    late_s: float | None = None  # after the specimen was freed, or the run's end; None: in time
+
+
+class JobFailed(Record):
+    """The worker gave up on a job."""
+
+    kind: Literal["job_failed"] = "job_failed"
+    job: str
+    job_kind: str
+    step: str
+    attempt: int
+    worker: str
+    error: str
+    message: str
+    traceback: str = ""  # only of an unexpected error

@@ -21,7 +21,7 @@ from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, 
 from service.benchmark.table import table_markdown
 from service.compute.ground_truth.surface import Surface, read_ply, write_ply
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
-from service.core.text.json_text import parse_json
+from service.core.text.files import parse_json
 from service.dataset.export_folder import SUMS
 from service.dataset.exported import data_set_of_folder
 from service.dataset.exporter import exporter, write_data_set

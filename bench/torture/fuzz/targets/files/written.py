@@ -22,7 +22,7 @@ from service.compute.poses.robot_files import read_hand_eye, read_joints_csv, re
 from service.core.geometry import Transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList
-from service.core.text.json_text import parse_json
+from service.core.text.files import parse_json
 from service.import_folder import import_rig
 from service.jobs.kind import read_part
 from service.jobs.records import Mounting

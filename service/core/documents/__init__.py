@@ -1,1 +1,0 @@
-"""The texts of generated documents, made from the models themselves."""

@@ -1,1 +1,0 @@
-"""Whether clocks, camera bodies and disk space suit a run, judged from the record."""

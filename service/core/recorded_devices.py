@@ -1,0 +1,233 @@
+"""What devices and photographs state about themselves: their identities, the camera bodies, what was exchanged. Pure.
+
+Drivers of any version wrote these data, so every field may be missing; no value of another type is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, cast
+
+from service.core.records.events import DeviceOpened, DeviceTrouble, Event, OperatorAction, RecordedView
+
+Plain = Mapping[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedIdentity:
+    """The device that answered when it was opened (drivers.interfaces.DeviceIdentity); "" where it was not stated."""
+
+    kind: str = ""  # robot, camera, scanner, ct, lightbox
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+    driver: str = ""
+    driver_version: str = ""
+    address: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedReport:
+    """The report of a device when it was opened (drivers.interfaces.DeviceReport).
+
+    Attributes:
+        identity: the device.
+        clock_offset_s: device clock minus host UTC, or minus host monotonic for an uptime clock; None: not reported.
+        clock: uptime: it counts from power-on. Old records do not say; there the kind of device decides.
+        details: what else it says of itself, by name.
+    """
+
+    identity: RecordedIdentity
+    clock_offset_s: float | None
+    clock: Literal["utc", "uptime"]
+    details: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedOptics:
+    """Camera, lens and settings that a photograph states (the field `camera` of a View); "" or None: not stated."""
+
+    model: str = ""
+    body_serial: str = ""
+    lens: str = ""
+    lens_serial: str = ""
+    focal_length_mm: float | None = None
+    aperture_f: float | None = None
+    focus_mode: str = ""
+    exif_time: str = ""
+
+
+def recorded_identity(stated: object) -> RecordedIdentity:
+    """The identity in a recorded DeviceReport; all fields are "" if there is none."""
+    fields = _mapping(stated)
+    return RecordedIdentity(
+        kind=_text(fields.get("kind")),
+        model=_text(fields.get("model")),
+        serial=_text(fields.get("serial")),
+        firmware=_text(fields.get("firmware")),
+        driver=_text(fields.get("driver")),
+        driver_version=_text(fields.get("driver_version")),
+        address=_text(fields.get("address")),
+    )
+
+
+def recorded_report(report: object) -> RecordedReport:
+    """The `report` of a device_opened event."""
+    fields = _mapping(report)
+    identity = recorded_identity(fields.get("identity"))
+    stated = fields.get("clock") or ("uptime" if identity.kind == "robot" else "utc")
+    clock = "uptime" if stated == "uptime" else "utc"
+    details = {name: str(value) for name, value in _mapping(fields.get("details")).items()}
+    return RecordedReport(identity, _number(fields.get("clock_offset_s")), clock, details)
+
+
+def recorded_optics(camera: object) -> RecordedOptics:
+    """The `camera` of a view's event. Zero stands for a length or f-number that the camera does not know."""
+    fields = _mapping(camera)
+    return RecordedOptics(
+        model=_text(fields.get("model")),
+        body_serial=_text(fields.get("body_serial")),
+        lens=_text(fields.get("lens")),
+        lens_serial=_text(fields.get("lens_serial")),
+        focal_length_mm=_number(fields.get("focal_length_mm")) or None,
+        aperture_f=_number(fields.get("aperture_f")) or None,
+        focus_mode=_text(fields.get("focus_mode")),
+        exif_time=_text(fields.get("exif_time")),
+    )
+
+
+def _mapping(value: object) -> Plain:
+    return cast("Plain", value) if isinstance(value, Mapping) else {}
+
+
+def _text(value: object) -> str:
+    return "" if value is None else str(value)
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+@dataclass(frozen=True, slots=True)
+class CameraBodies:
+    """The serial numbers of a run's cameras.
+
+    Attributes:
+        wires: serial number that a camera states over its connection → device name in rig.yaml. Over USB a camera may
+            put digits of its model before those of the body.
+        stated: the distinct serial numbers that the photographs state.
+    """
+
+    wires: Mapping[str, str]
+    stated: tuple[str, ...]
+
+    def shown(self, identity: RecordedIdentity) -> str:
+        """The serial number to show for a device: for a camera that of the body, as its photographs state it."""
+        return self._own(identity.serial) if identity.kind == "camera" else identity.serial
+
+    def _own(self, wire: str) -> str:
+        return next((number for number in self.stated if wire and _same(wire, number)), wire)
+
+    @property
+    def explained(self) -> tuple[str, ...]:
+        """One sentence for each camera that is shown under another number than it states over its connection."""
+        return tuple(
+            f"The serial number of {device} is {self._own(wire)}, as every photograph of it states. Over its "
+            f"connection it states {wire}, which ends with the same digits: it is one and the same body"
+            for wire, device in self.wires.items()
+            if self._own(wire) != wire
+        )
+
+    @property
+    def strange(self) -> str:
+        """A sentence on photographs whose serial number belongs to none of the opened cameras; "" without any."""
+        known = [wire for wire in self.wires if wire]
+        others = [number for number in self.stated if not any(_same(wire, number) for wire in known)]
+        if not known or not others:
+            return ""
+        return (
+            f"Photographs state the serial number {' and '.join(others)}, and no camera that was opened does: "
+            f"{', '.join(f'{self.wires[wire]} states {wire}' for wire in known)}. They are of another body"
+        )
+
+
+def bodies(events: Sequence[Event]) -> CameraBodies:
+    """The serial numbers in a run's events."""
+    opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
+    views = (event.payload for event in events if isinstance(event.payload, RecordedView))
+    identities = ((payload.device, recorded_report(payload.report).identity) for payload in opened)
+    return bodies_of(identities, (recorded_optics(view.camera).body_serial for view in views))
+
+
+def bodies_of(identities: Iterable[tuple[str, RecordedIdentity]], stated: Iterable[str]) -> CameraBodies:
+    """The serial numbers of cameras.
+
+    Args:
+        identities: (name in rig.yaml, identity in its DeviceReport) of each opened device.
+        stated: serial numbers in the photographs; "" is ignored.
+    """
+    wires = {identity.serial: name for name, identity in identities if identity.kind == "camera"}
+    return CameraBodies(wires, tuple(dict.fromkeys(number for number in stated if number)))
+
+
+def _same(one: str, other: str) -> bool:
+    a, b = one.lstrip("0"), other.lstrip("0")
+    return bool(a and b) and (a.endswith(b) or b.endswith(a))
+
+
+CHANGED = "DeviceChangedError"  # the name under which it is recorded
+# Nothing is calibrated with these: that one was exchanged is said and recorded, and nobody is asked.
+NOT_CALIBRATED = frozenset({"lightbox", "ct"})
+_DECIDES = frozenset({"confirm", "redo", "skip"})
+
+
+def exchanged(events: Iterable[Event], device: str, opened: RecordedIdentity) -> RecordedIdentity | None:
+    """The device that a run has used so far under this name in the rig file; None if it is the one opened now.
+
+    A device that states no serial number is told by its model. Another one is the run's own if it answers after
+    a person who was asked about it has decided to go on.
+
+    Args:
+        events: of the run, before this opening.
+        device: name in the rig file.
+        opened: what answered.
+    """
+    own: RecordedIdentity | None = None
+    other: RecordedIdentity | None = None  # that answered last, instead of it
+    asked = decided = False  # about that one; a person who decided may have put either in place
+    for event in events:
+        match event.payload:
+            case DeviceOpened(device=name, report=report) if name == device:
+                found = recorded_report(report).identity
+                if own is None or (decided and other is not None and _same_device(other, found)):
+                    own = found
+                if _same_device(own, found):
+                    other, asked, decided = None, False, False
+                elif other is None or not _same_device(other, found):
+                    other, asked, decided = found, False, False
+            case DeviceTrouble(device=name, error=error) if name == device and error == CHANGED:
+                asked = True
+                decided = other is not None and other.kind in NOT_CALIBRATED
+            case OperatorAction(action=action) if asked and action in _DECIDES:
+                decided = True
+            case _:
+                pass
+    if own is None or _same_device(own, opened) or (decided and other is not None and _same_device(other, opened)):
+        return None
+    return own
+
+
+def exchanged_words(device: str, before: RecordedIdentity, now: RecordedIdentity) -> str:
+    """`camera is another camera: it has the serial number 5678, the one before had 1234`."""
+    if now.serial and before.serial:
+        what = f"it has the serial number {now.serial}, the one before had {before.serial}"
+    else:
+        what = f"it is a {now.model}, the one before was a {before.model}"
+    return f"{device} is another {now.kind or 'device'}: {what}"
+
+
+def _same_device(one: RecordedIdentity, other: RecordedIdentity) -> bool:
+    if one.serial and other.serial:
+        return one.serial == other.serial
+    return not one.model or not other.model or one.model == other.model

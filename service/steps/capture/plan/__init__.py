@@ -1,1 +1,0 @@
-"""What a capture will do, known before it begins: viewpoints, reachable order, duration."""

@@ -1,0 +1,289 @@
+"""Lists the jobs of a run that are due, and estimates how long they still take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from service.core.jobs import Jobs, Reference, job_key, jobs_of, newest_job
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import LATER, WAITED, RunState
+from service.jobs.kind import JobRecord, read_part
+from service.jobs.poses import features, hybrid, match, structure_from_motion
+from service.jobs.records import Camera, ImageFile
+from service.jobs.registration import detect_spheres, evaluate, register
+from service.steps.context import JobRequest
+from service.steps.front_end import early_matches
+from service.steps.registration_jobs import RegistrationJobs, Task, name_of, recorded_registration_jobs
+from service.steps.registration_sources import WantedRegistrations, evaluated_step, evaluations_of
+from service.store.records import NewJob
+
+
+class _Evaluated(JobRecord):
+    """The registrations of an evaluation job by name, as recorded: values or references."""
+
+    registrations: dict[str, object]
+
+
+def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None) -> dict[str, Task]:
+    """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration.
+
+    Args:
+        state: of the run.
+        step: the evaluation.
+        found: the jobs of the registration step that it evaluates, as recorded; None if that has not begun them.
+    """
+    if step.gives != "accuracy" or state.steps[step.id].skipped:
+        return {}
+    own = [j for j in state.steps[step.id].jobs.values() if j.kind == evaluate.KIND.name and j.priority == WAITED]
+    newest = max(own, key=lambda job: job.enqueued_seq, default=None)
+    if newest is None or newest.status != "finished" or found is None:
+        return {}
+    tasks: dict[str, Task] = {}
+    evaluated = _Evaluated.model_validate(newest.arguments).registrations
+    for name, job in found.arrived.items():
+        if name not in evaluated:
+            arguments = {**newest.arguments, "registrations": {name: Reference(job.job, "result").record()}}
+            key = f"{name}-{name_of(newest)}"
+            request = JobRequest(evaluate.KIND.name, arguments, LATER, 2)
+            tasks[name] = Task(key, request, newest_job(state, step.id, request.kind, key))
+    return tasks
+
+
+def due(protocol: Protocol, state: RunState) -> list[NewJob]:
+    """All jobs that can be enqueued now because the results they need exist; none in an aborted run."""
+    if state.status == "aborted":
+        return []
+    jobs = early_matches(protocol, state)
+    recorded = {step.id: recorded_registration_jobs(protocol, state, step) for step in protocol.steps}
+    for step in protocol.steps:
+        found = recorded[step.id]
+        tasks = [] if found is None else found.due
+        if step.gives == "accuracy":
+            late = evaluation_tasks(state, step, recorded[evaluated_step(step)])
+            tasks += [task for task in late.values() if task.job is None]
+        jobs += [new_job(state, step.id, task) for task in tasks]
+    return jobs
+
+
+def new_job(state: RunState, step: str, task: Task) -> NewJob:
+    """The job to enqueue for a task."""
+    key = job_key(state, step, task.request.kind, task.name)
+    request = task.request
+    return NewJob(
+        request.kind,
+        step,
+        state.steps[step].attempt,
+        key,
+        request.arguments,
+        priority=request.priority,
+        version=request.version,
+    )
+
+
+# Kinds of jobs that the run has not computed yet are estimated from other runs: seconds per image of 1920 × 1280 px
+# on one core, in proportion to the number of pixels for jobs that search the image.
+
+_NAMES = {
+    "robot": "robot poses as reported",
+    "robot_corrected": "robot poses, corrected",
+    "spheres": "poses by the spheres in each image",
+    "triangulated": "triangulation from corrected robot poses",
+    "colmap": "COLMAP from scratch",
+    "glomap": "GLOMAP from scratch",
+    "hybrid": "images, robot and spheres together",
+}
+_GUESS_S = {  # per image
+    detect_spheres.KIND.name: 0.3,
+    register.KIND.name: 0.15,
+    features.KIND.name: 1.5,
+    match.KIND.name: 0.4,
+    structure_from_motion.KIND.name: 1.5,
+    hybrid.KIND.name: 0.5,
+    evaluate.KIND.name: 0.1,
+}
+_BY_PIXELS = frozenset({detect_spheres.KIND.name, features.KIND.name})
+_PIXELS = 1920 * 1280
+_SEVERAL_CORES = frozenset({detect_spheres.KIND.name})
+
+
+@dataclass(frozen=True, slots=True)
+class PendingResult:
+    """A result that has not arrived: the estimated `seconds` until it does, or why it has `failed`."""
+
+    name: str
+    what: str
+    seconds: float
+    failed: str = ""
+    waits: bool = False  # no job of the run is being computed: no worker runs, or it computes for other runs
+
+    @property
+    def text(self) -> str:
+        """`COLMAP from scratch: still computing, about 4 min left`."""
+        if self.failed:
+            return f"{self.what}: there will be none, {self.failed}"
+        takes = f"about {duration_words(self.seconds)}"
+        return f"{self.what}: " + (
+            f"waits for a worker, then {takes}" if self.waits else f"still computing, {takes} left"
+        )
+
+
+def duration_words(seconds: float) -> str:
+    """A duration rounded to the precision of an estimate: `20 s`, `4 min`."""
+    if seconds < 90:
+        return f"{max(10, 10 * round(seconds / 10))} s"
+    return f"{round(seconds / 60)} min"
+
+
+def missing_results(
+    protocol: Protocol, state: RunState, started_utc: Mapping[str, str], now_utc: str, cores: int
+) -> list[PendingResult]:
+    """The planned results that have not arrived, in the order in which they are expected.
+
+    Args:
+        protocol: of the run.
+        state: of the run.
+        started_utc: when each job that is being computed now was started, by job id.
+        now_utc: the present time.
+        cores: number of jobs computed in parallel.
+    """
+    left: list[PendingResult] = []
+    for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run
+        found = recorded_registration_jobs(protocol, state, step)
+        if found is not None:
+            evaluation = next(iter(evaluations_of(protocol, step)), None)
+            left += _left_of(state, step, evaluation, found, _JobTimes(state, started_utc, now_utc, cores))
+    return sorted(left, key=lambda one: one.seconds)
+
+
+class _Work(JobRecord):
+    """The arguments of a job, of any kind, that its duration depends on."""
+
+    poses: str = ""
+    mappers: tuple[str, ...] = ()
+    images: tuple[ImageFile, ...] = ()
+    pairs: tuple[tuple[str, str], ...] = ()
+
+    def count(self, kind: str) -> int:
+        """Number of images, or of pairs."""
+        return len(self.pairs if kind == match.KIND.name else self.images)
+
+    def size(self, kind: str) -> float:
+        """The number, weighted by their pixels for jobs whose duration depends on them."""
+        return self.count(kind)
+
+
+class _Search(_Work):
+    """Work whose duration depends on the size of the images, because they are searched as a whole."""
+
+    camera: Camera | None = None
+    reduced_to: tuple[int, int] | None = None
+
+    def size(self, kind: str) -> float:
+        """The number, weighted by their pixels."""
+        if self.camera is None:
+            return self.count(kind)
+        width, height = self.reduced_to or (self.camera.width, self.camera.height)
+        return self.count(kind) * width * height / _PIXELS
+
+
+def _work(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> _Work:
+    return read_part(_Search if kind in _BY_PIXELS else _Work, arguments, jobs)
+
+
+@dataclass(frozen=True, slots=True)
+class _JobTimes:
+    """How long the jobs of a run take."""
+
+    state: RunState
+    started_utc: Mapping[str, str]
+    now_utc: str
+    cores: int
+
+    def seconds(self, task: Task) -> float:
+        """Seconds until a task is done, counted from its start; 0 if it is done."""
+        job = task.job
+        if job is not None and job.status != "enqueued":
+            return 0.0
+        kind = task.request.kind
+        expected_s = self.expected_s(kind, _work(kind, task.request.arguments, jobs_of(self.state)))
+        begun = None if job is None else self.started_utc.get(job.job)
+        if begun is None:
+            return expected_s
+        gone_s = (datetime.fromisoformat(self.now_utc) - datetime.fromisoformat(begun)).total_seconds()
+        return max(expected_s - max(0.0, gone_s), 0.1 * expected_s)  # negative: the clock was set back
+
+    def expected_s(self, kind: str, work: _Work) -> float:
+        """Expected duration of a job, from the jobs of its kind in this run if there are any."""
+        jobs = jobs_of(self.state)
+        ended = [job for job in jobs.values() if job.kind == kind and job.status == "finished"]
+        done = [(job, _work(kind, job.arguments, jobs)) for job in ended]
+        like = [(job, other) for job, other in done if _tells_of(other, work) and other.count(kind) > 0]
+        if like:
+            spent_s = sum(job.duration_s for job, _ in like)
+            return work.size(kind) * spent_s / sum(other.size(kind) for _, other in like)
+        return work.size(kind) * _GUESS_S.get(kind, 0.0) / (self.cores if kind in _SEVERAL_CORES else 1)
+
+
+def _tells_of(done: _Work, work: _Work) -> bool:
+    return (done.poses, done.mappers) == (work.poses, work.mappers)
+
+
+def _left_of(
+    state: RunState,
+    step: Step,
+    evaluation: Step | None,
+    found: RegistrationJobs,
+    clock: _JobTimes,
+) -> list[PendingResult]:
+    """The missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
+    wanted = WantedRegistrations.of(step.params)
+    evaluations = {} if evaluation is None else evaluation_tasks(state, evaluation, found)
+    free_s = [0.0] * clock.cores
+    ready_s: dict[tuple[str, str], float] = {}
+    left: list[PendingResult] = []
+    first = read_part(_Work, found.tasks[0].request.arguments) if found.tasks else _Work()
+    for name, (source, size) in wanted.registrations.items():
+        what = _NAMES.get(source, source) + (f" at {size.replace('x', ' × ')}" if size else "")
+        if name in found.failed:
+            left.append(PendingResult(name, what, 0.0, found.failed[name]))
+            continue
+        evaluating = evaluations.get(name)
+        if name in found.arrived and (evaluating is None or (evaluating.job and evaluating.job.status != "enqueued")):
+            continue
+        steps = found.tasks_for.get(name, ())
+        at_s = 0.0
+        for task in steps:
+            key = (task.request.kind, task.name)
+            if key not in ready_s:
+                core = free_s.index(min(free_s))
+                begin_s = max(at_s, free_s[core])
+                ready_s[key] = begin_s + clock.seconds(task)
+                if ready_s[key] > begin_s:
+                    free_s[core] = ready_s[key]
+            at_s = max(at_s, ready_s[key])
+        last = steps[-1].request if steps else None
+        if last is not None and name not in found.arrived:
+            rest = _Work(images=first.images, poses=source)
+            at_s += sum(clock.expected_s(kind, rest) for kind in _rest(source, last.kind))
+        if evaluation is not None and any(task.request.priority != WAITED for task in steps):
+            at_s += clock.expected_s(evaluate.KIND.name, first)
+        left.append(PendingResult(name, what, at_s))
+    return left
+
+
+_MODELLED = (features.KIND.name, match.KIND.name, structure_from_motion.KIND.name)
+_CHAINS = {
+    "triangulated": _MODELLED,
+    "colmap": _MODELLED,
+    "glomap": _MODELLED,
+    "hybrid": (*_MODELLED, hybrid.KIND.name),
+}
+
+
+def _rest(source: str, last: str) -> tuple[str, ...]:
+    """The kinds of jobs that follow the last one that is planned."""
+    chain = (detect_spheres.KIND.name, *_CHAINS.get(source, ()), register.KIND.name)
+    return chain[chain.index(last) + 1 :] if last in chain else ()

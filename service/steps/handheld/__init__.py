@@ -1,1 +1,0 @@
-"""Captures with the camera in the hand: the parts of the step kind `manual_capture`."""

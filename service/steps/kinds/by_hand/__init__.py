@@ -1,1 +1,0 @@
-"""Steps that a person does by hand, and confirms."""

@@ -1,1 +1,0 @@
-"""Steps that take images or the camera's calibration at the table."""

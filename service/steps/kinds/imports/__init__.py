@@ -1,1 +1,0 @@
-"""Steps that bring in what other devices made: CT, scan, photographs."""

@@ -1,1 +1,0 @@
-"""Steps that compute and judge a result."""

@@ -1,1 +1,0 @@
-"""The sources of camera poses: which jobs lead to each registration, and how long they take."""
