@@ -39,6 +39,7 @@ from service.core.records.events import (
     StepStarted,
 )
 from service.core.run.fold import fold
+from service.core.run.state import LATER
 from service.dataset.registrations import late_results, shared_adjustment_note
 from service.rig import load_rig
 from service.run_record import RunRecord, read_log

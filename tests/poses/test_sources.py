@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.cli.status import status_record
+from service.core.gates.release import late_s, late_words
 from service.core.geometry import look_at
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
 from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, RunStarted
