@@ -65,14 +65,16 @@ class FieldLengths:
     reach_m: float = 0.006
 
 
-def deviation_field(surface: Surface, links: csr_matrix, known_m: Array, known: Mask, lengths: FieldLengths) -> Array:
+def _deviation_field(
+    surface: Surface, links: csr_matrix, known_m: Array, known: Mask, lengths: FieldLengths
+) -> Array:
     """(V,) metres: follows `known_m` where it is `known`, and decays from there along the surface.
 
     It minimises the squared differences over the edges, with weights towards the known values and, elsewhere, 0.
 
     Args:
         surface: a mesh.
-        links: its `adjacency`.
+        links: its `_adjacency`.
         known_m: (V,) deviations, along the normals.
         known: (V,) where they count.
         lengths: of smoothing and decay.
@@ -99,13 +101,13 @@ def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = N
     Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
     neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
     neighbours. Faces that still turn over move as one piece with what is around them. `known` is the surface's
-    `adjacency`, if it was computed before.
+    `_adjacency`, if it was computed before.
     """
     points = surface.vertices_m + move_m
     folded = _folded(surface, points, np.arange(len(surface.faces)))
     if not len(folded):
         return Surface(points, surface.faces), 0
-    links = adjacency(surface) if known is None else known
+    links = _adjacency(surface) if known is None else known
     means: csr_matrix = (diags(1 / np.maximum(np.asarray(links.sum(axis=1)).ravel(), 1.0)) @ links).tocsr()
     for rings in (*_ALIKE, *_ROUNDED):
         around = np.zeros(len(points))
@@ -150,7 +152,7 @@ def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -
     return share, np.asarray(connected_components(inside @ links @ inside, directed=False)[1], dtype=np.int64)
 
 
-def adjacency(surface: Surface) -> csr_matrix:
+def _adjacency(surface: Surface) -> csr_matrix:
     """(V, V) 1 for each pair of vertices with an edge between them."""
     f, n = surface.faces, len(surface.vertices_m)
     begun = np.zeros(n + 1, dtype=np.int64)
@@ -300,8 +302,8 @@ def fuse(
     within = distance_to(carrier.vertices_m, ~usable, chosen.blend_m) / chosen.blend_m
     weight, detail = _smooth_step(within), _smooth_step((within - _DETAIL_FROM) / (1 - _DETAIL_FROM))
     known_m = np.where(usable, -seen.offset_m, 0.0)
-    links = adjacency(carrier)
-    followed = deviation_field(carrier, links, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
+    links = _adjacency(carrier)
+    followed = _deviation_field(carrier, links, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
     onto = seen.nearest_m - carrier.vertices_m
     moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed), links)
     del links

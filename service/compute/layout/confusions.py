@@ -34,7 +34,7 @@ def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
     return np.sqrt(np.maximum(square, 0.0) / seen.shape[1])
 
 
-def rigid_motions(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array]:
+def _rigid_motions(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array]:
     """R (M, 3, 3) and t (M, 3) of the rigid motion that best maps `seen` onto `taken`."""
     _, _, R, _ = _aligned(centres, seen, taken)  # a ≈ R b
     turned = np.swapaxes(R, 1, 2)
@@ -212,7 +212,7 @@ def by_visible_count(centres: Array, matches: Confusions, order: IntArray) -> di
     n = len(centres)
     seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
     found = {SUBSET: Confusions(seen, taken, matches.misfit[order[:2000]])}
-    R, t = rigid_motions(centres, seen, taken)
+    R, t = _rigid_motions(centres, seen, taken)
     carried = np.einsum("mij,nj->mni", R, centres) + t[:, None]
     distance = np.linalg.norm(carried[:, :, None] - centres[None, None], axis=3)
     rows = np.arange(len(seen))

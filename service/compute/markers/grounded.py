@@ -67,7 +67,7 @@ class GroundedDetector:
         """The outlines in an image (H, W, 3) of the camera's size, the most certain first."""
         boxes = [_widened(box) for box in find_boxes(image_bgr, self.networks, self.least, options)]
         roughs: list[RoughSphere] = []
-        for box, mask in zip(boxes, sphere_masks(image_bgr, boxes, self.networks), strict=True):
+        for box, mask in zip(boxes, _sphere_masks(image_bgr, boxes, self.networks), strict=True):
             if mask is not None and (rough := _rough(image_bgr, camera, fit_ellipse(mask, box))) is not None:
                 roughs.append(rough)
         roughs.sort(key=lambda rough: -rough.score)
@@ -259,7 +259,7 @@ def _overlap(a: Array, b: Array) -> bool:
 _PICTURES_AT_ONCE = 6  # pictures given to the network at once: two boxes
 
 
-def sphere_masks(
+def _sphere_masks(
     image_bgr: NDArray[np.uint8], boxes: Sequence[Box], networks: Networks
 ) -> Iterator[NDArray[np.bool_] | None]:
     """For each box a (MASK_SIDE, MASK_SIDE) mask of the sphere in its middle; None if there is none.

@@ -164,7 +164,7 @@ def locate_outlines(
     sets = [np.nonzero((stations == g) & (shown == s))[0] for g in np.unique(stations) for s in np.unique(shown)]
     with _mapping(workers, n) as map_over:
         look = partial(_look, camera=images.camera, options=options)
-        first = register_anchors(image_paths, images, spheres, [m for m in sets if len(m)], options, map_over)
+        first = _register_anchors(image_paths, images, spheres, [m for m in sets if len(m)], options, map_over)
         if first is None:
             found = tuple(_counted(map_over(look, [_Task(path) for path in image_paths]), n, progress))
             return searched_whole([f.outlines for f in found])
@@ -300,7 +300,7 @@ class AnchorRegistration:
     anchors: tuple[int, ...]
 
 
-def register_anchors(
+def _register_anchors(
     image_paths: Sequence[Path],
     images: PosedImages,
     spheres: ScanSpheres,

@@ -95,7 +95,7 @@ def light_of(*, srgb: bool) -> Array32:
     return linear.astype(np.float32)
 
 
-def to_light(coded: Coded, *, srgb: bool) -> Array32:
+def _to_light(coded: Coded, *, srgb: bool) -> Array32:
     """Linear light of coded values."""
     if coded.dtype == np.uint8:
         return light_of(srgb=srgb)[coded.astype(np.uint8, copy=False)]
@@ -422,7 +422,7 @@ def _albedo(profiles: LimbProfiles, usable: Mask) -> Array32:
     inner = np.moveaxis(profiles.coded_bgr[:, :, t < t[0] + 2.1], 3, 1)  # (G, 3, K, n)
     mask = np.broadcast_to(usable[:, None, :, None], inner.shape)
     flat = (*inner.shape[:2], -1)
-    colour = masked_median(to_light(inner, srgb=profiles.srgb).reshape(flat), mask.reshape(flat))
+    colour = masked_median(_to_light(inner, srgb=profiles.srgb).reshape(flat), mask.reshape(flat))
     return (colour / np.maximum(colour @ TO_YCC[0], 1e-4)[:, None]).astype(np.float32)
 
 
@@ -430,7 +430,7 @@ def _start(profiles: LimbProfiles) -> Array:
     coded, t = profiles.coded_bgr, profiles.offsets
     p = np.zeros((*coded.shape[:2], OWN))
     for first, side in ((0, (t < -1.2) & (t > -4)), (5, (t > 1.2) & (t < 4))):
-        p[..., first : first + 3] = np.maximum(to_light(coded[:, :, side], srgb=profiles.srgb).mean(axis=2), 1e-4)
+        p[..., first : first + 3] = np.maximum(_to_light(coded[:, :, side], srgb=profiles.srgb).mean(axis=2), 1e-4)
     return p
 
 

@@ -51,7 +51,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
         poses = read_transforms_json(path)
     elif path.suffix.lower() in {".csv", ".txt", ".tum", ".tsv"}:
         table = read_table(file_bytes(path), str(path))
-        poses = trajectory_poses(table, path) if is_trajectory(table) else read_poses_csv(path)
+        poses = _trajectory_poses(table, path) if _is_trajectory(table) else read_poses_csv(path)
     else:
         raise DataError(
             "unknown kind of pose file",
@@ -331,7 +331,7 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
 _COLUMNS = 8
 
 
-def is_trajectory(table: TextTable) -> bool:
+def _is_trajectory(table: TextTable) -> bool:
     """Whether a table has eight numbers in its first line, separated by spaces, and so no header and no names."""
     if not table.rows or table.dialect.separator != " ":
         return False
@@ -339,7 +339,7 @@ def is_trajectory(table: TextTable) -> bool:
     return len(cells) == _COLUMNS and all(map(is_number, cells))
 
 
-def trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
+def _trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
     """T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
 
     Raises:

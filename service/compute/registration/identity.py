@@ -154,7 +154,7 @@ def _require_any(
             "capture images that show more of the registration spheres, or check the detector's options",
         )
     centres_m = np.asarray(spheres.centres_m, dtype=np.float64)
-    other = words_of_other_scale(outlines, names, centres_m, spheres.radius_m, camera)
+    other = _words_of_other_scale(outlines, names, centres_m, spheres.radius_m, camera)
     raise ComputeError(
         f"no image shows four of the {len(centres_m)} spheres in the arrangement of the sphere list (spheres found: "
         f"{counts}){other}",
@@ -393,7 +393,7 @@ _LEAST = 5  # spheres that one image must show: four agree by chance in one of s
 _NEAR = 0.03  # relative, to one of the mistakes
 
 
-def words_of_other_scale(
+def _words_of_other_scale(
     outlines: Sequence[Sequence[SphereOutline]],
     names: Sequence[str],
     centres_m: Array,

@@ -68,7 +68,7 @@ def register(
     """
     problem = assemble(outlines, assignments, images, spheres, settings)
     _require(problem, np.ones(len(problem.members), dtype=bool))
-    start = starting_state(problem, assignments, images)
+    start = _starting_state(problem, assignments, images)
     noise = _noise(problem, settings.pose_covariance, start.scale)
     solution = _solve(problem, start, noise, robust=settings.robust, cost=settings.cost)
     return _result(solution, images.stations, settings.cost)
@@ -317,7 +317,7 @@ def _components(s: Solution) -> dict[str, Array]:
     return {**caused, "spheres": caused["spheres"] + s.by_own_light()}
 
 
-def starting_state(problem: Problem, assignments: Sequence[Assignment], images: PosedImages) -> State:
+def _starting_state(problem: Problem, assignments: Sequence[Assignment], images: PosedImages) -> State:
     """Initial bases and scale from the assignments' poses: the mean of the half of each station's images that agree.
 
     Raises:

@@ -47,7 +47,7 @@ def main(log: str, seed: int, pipe: Connection) -> None:
     tasks: dict[str, Callable[[dict[str, Any], Progress], Any]] = {
         "extract": _extract,
         "match": _match,
-        "map": map_images,
+        "map": _map_images,
     }
 
     def progress(stage: str, done: int, total: int) -> None:
@@ -121,7 +121,7 @@ _SHARE = 600  # tracks per image for the mapper
 _PAIR_SHARE = 60  # tracks per pair, if it has as many
 
 
-def map_images(job: dict[str, Any], progress: Progress) -> dict[str, Any]:
+def _map_images(job: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Poses and tracks of the largest model of a job's images, adjusted and written into its workspace."""
     camera = CameraModel(**job["camera"])
     features = Features([np.asarray(pixels, dtype=np.float64) for pixels in job["pixels"]], camera)
