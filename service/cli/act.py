@@ -19,7 +19,7 @@ from service.core.run.actions import VERBS, capture_refusal, record_to_sign, ref
 from service.core.run.fold import fold
 from service.core.run.state import RunState, connected_arms, lost_arms
 from service.core.text.words import reason_of
-from service.jobs.words import term
+from service.jobs import term
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts, who_pauses
 from service.people.sessions import People

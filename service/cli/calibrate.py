@@ -61,10 +61,10 @@ from service.core.geometry import Array, Transform
 from service.core.text.files import file_text, parse_json
 from service.core.text.words import counted
 from service.core.units import LengthUnit, mm
-from service.jobs.calibration.records import BoardSeen, HandEye
+from service.jobs.calibration_records import BoardSeen, HandEye
 from service.jobs.kind import JobRecord
 from service.jobs.records import Matrix, matrix
-from service.worker.calibration.records import hand_eye_record, seen_board
+from service.worker.records import hand_eye_record, seen_board
 
 _BESIDE = {"T_flange_camera": "T_base_camera", "T_base_board": "T_flange_board"}
 

@@ -45,7 +45,7 @@ from service.core.units import mm
 from service.dataset.export_folder import check_folder
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary, summarise
-from service.jobs.registration.evaluate import Row
+from service.jobs.evaluate import Row
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

@@ -44,7 +44,7 @@ from service.core.units import megabytes
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import summarise
 from service.import_folder import CtReading, find_places, import_rig, list_import
-from service.jobs.registration.evaluate import Row
+from service.jobs.evaluate import Row
 from service.rig import Rig
 from service.run_record import recorded_root
 from service.run_start import start_run

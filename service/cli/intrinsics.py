@@ -42,8 +42,8 @@ from service.compute.intrinsics.uncertainty import (
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.text.words import counted
 from service.core.units import metres, mm
-from service.jobs.calibration.records import Intrinsics
-from service.worker.calibration.records import intrinsics_record
+from service.jobs.calibration_records import Intrinsics
+from service.worker.records import intrinsics_record
 
 _SQUARE_MM = (0.5, 1000.0)  # plausible squares; anything else is probably in another unit
 

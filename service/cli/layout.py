@@ -22,7 +22,7 @@ from service.compute.poses.camera_files import read_camera_json, read_spheres_js
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import metres, mm
-from service.worker.surfaces.records import judged_layout
+from service.worker.records import judged_layout
 
 
 def layout_command(

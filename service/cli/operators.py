@@ -25,7 +25,7 @@ from service.core.run.state import RunState
 from service.core.shown_text import shown
 from service.core.text.files import parse_json
 from service.core.text.words import reason_of
-from service.jobs.words import term
+from service.jobs import term
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for

@@ -31,7 +31,7 @@ from service.cli.terminal_output import styled
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe
 from service.core.units import megabytes
-from service.jobs.words import term
+from service.jobs import term
 from service.worker.loop import HANDLERS
 
 _COULD_NOT = 2

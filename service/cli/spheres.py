@@ -35,7 +35,7 @@ from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.words import counted
 from service.core.units import metres, mm
-from service.worker.surfaces.records import measured_sphere
+from service.worker.records import measured_sphere
 
 _NAMED = 3  # most spheres listed in an error
 

@@ -19,7 +19,7 @@ from service.core.units import mm, mrad
 from service.dataset.further_cameras import pose_sigmas
 from service.dataset.registrations import further_cameras
 from service.dataset.summary import RunSummary
-from service.jobs.registration.further_camera import Answer
+from service.jobs.further_camera import Answer
 
 
 @dataclass(frozen=True, slots=True)

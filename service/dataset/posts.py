@@ -13,7 +13,7 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Array, apply, inverse
 from service.dataset.records import Mesh, PosedView
 from service.dataset.summary import RunSummary
-from service.jobs.registration.register import ARM
+from service.jobs.register import ARM
 from service.rig import RigSection, parse_recorded_rig
 
 _CANDIDATES = 300  # faces whose normals are tried as the board's

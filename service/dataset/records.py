@@ -17,7 +17,7 @@ from service.compute.pixels.views import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement, Party, doi_address, licence_address, party
-from service.jobs.registration.evaluate import ErrorBudget, Row
+from service.jobs.evaluate import ErrorBudget, Row
 
 NOT_STATED = "not stated"
 

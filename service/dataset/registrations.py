@@ -19,11 +19,10 @@ from service.core.gates.release import late_words
 from service.core.protocol.models import Protocol
 from service.core.protocol.step_params import Gives
 from service.core.run.state import JobState, RunState, lane_of
+from service.jobs import evaluate, further_camera, register, structure_from_motion
+from service.jobs.evaluate import ErrorBudget, Row
 from service.jobs.kind import JobRecord
-from service.jobs.poses import structure_from_motion
-from service.jobs.registration import evaluate, further_camera, register
-from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Registration, Registrations
+from service.jobs.register import Registration, Registrations
 
 _R = TypeVar("_R", bound=JobRecord)
 

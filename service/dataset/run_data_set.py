@@ -31,7 +31,7 @@ from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary, control_centres, control_scan, registered_scan
 from service.dataset.view_covariances import view_covariances
 from service.jobs.records import SpheresFound
-from service.jobs.registration.register import Registration
+from service.jobs.register import Registration
 
 _POINTS = 2000  # of the mesh, by which the sparse views are chosen
 

@@ -28,10 +28,10 @@ from service.dataset.registrations import (
     registrations,
     result_of_step,
 )
+from service.jobs import fuse
+from service.jobs.evaluate import ErrorBudget, Row
 from service.jobs.records import Point, SpheresFound
-from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Registration
-from service.jobs.surfaces import fuse
+from service.jobs.register import Registration
 from service.store.store import Store
 
 

@@ -16,9 +16,8 @@ from service.core.jobs import jobs_of
 from service.core.run.state import JobState
 from service.core.units import mm, mrad
 from service.dataset.summary import RunSummary
-from service.jobs.poses import hybrid
-from service.jobs.registration import register
-from service.jobs.registration.register import Registration
+from service.jobs import hybrid, register
+from service.jobs.register import Registration
 
 
 def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:

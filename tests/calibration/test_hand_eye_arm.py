@@ -35,7 +35,7 @@ from service.core.arms.model import ArmModel, arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from service.jobs import records
-from service.worker.calibration.records import arm_correction_record, corrected_mounting, hand_eye_record
+from service.worker.records import arm_correction_record, corrected_mounting, hand_eye_record
 from simulators.scene.arm import ARM_ERRORS, ArmErrorKind, ArmErrors, perturbed_forward
 from simulators.scene.factory_calibrations import CALIBRATIONS, draw_departures
 from simulators.scene.world import Scene

@@ -27,7 +27,7 @@ from service.compute.matching.methods.method import matchers
 from service.core.protocol.models import irreversible_warning, load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.exporter import exporters
-from service.jobs.words import term
+from service.jobs import term
 from service.steps import params_models
 from service.steps.live_numbers import seen_words
 from tests.support.processes.forked import Forked

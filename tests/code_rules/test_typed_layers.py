@@ -47,8 +47,8 @@ EDGES = {
     "service/dataset/croissant.py": "writes croissant.json",
     "service/dataset/about_run.py": "writes dataset.json",
     "service/dataset/formats/radiance.py": "writes unit_box.json",
-    "service/worker/capture/held_images.py": "writes and reads the file of a hand-held image",
-    "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
+    "service/worker/hand_answer.py": "writes and reads the file of a hand-held image",
+    "service/worker/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/sfm/colmap_process.py": "messages of a child process",
     "service/compute/sfm/child.py": "messages of a child process",

@@ -15,7 +15,7 @@ from service.core.run.state import JobState
 from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import RunSummary
 from service.dataset.view_covariances import pose_covariance
-from service.jobs.registration import register
+from service.jobs import register
 from service.worker.job import JobAnswer
 from tests.support.recorded.recomputed import ARM, arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run

@@ -27,7 +27,7 @@ from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_
 from service.core.run.state import Deviation, RunState
 from service.core.text.words import counted
 from service.dataset.registrations import LateResult, late_results
-from service.jobs.registration import evaluate
+from service.jobs import evaluate
 from service.store.store import Store
 
 CHUNK = 300  # events in one step, after which waiting pages come first

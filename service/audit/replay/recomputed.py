@@ -20,7 +20,7 @@ from service.core.records.events import ArtefactRef, JobFinished
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary
-from service.jobs.registration import register
+from service.jobs import register
 from service.store.artefacts import hash_file
 from service.worker.job import JobAnswer
 

@@ -25,7 +25,7 @@ from service.core.text.words import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 from service.dataset.registrations import late_results, shared_adjustment_note
 from service.dataset.summary import RunSummary
-from service.jobs.registration.evaluate import ErrorBudget, Row
+from service.jobs.evaluate import ErrorBudget, Row
 
 PAPER_LIMIT_MM = 0.35
 _LIMITED = "best_mean_radial_error_mm"

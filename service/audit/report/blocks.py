@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing, figure, limits, standing
 from service.core.records.events import GateVerdict
-from service.jobs.words import term
+from service.jobs import term
 
 Tone = Literal["plain", "ok", "attention", "stop"]
 Style = Literal["text", "number", "code"]

@@ -33,8 +33,8 @@ from service.core.geometry import Array
 from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import RecordedView
 from service.core.units import mm
-from service.jobs.calibration import calibrate
-from service.jobs.calibration.records import (
+from service.jobs import calibrate
+from service.jobs.calibration_records import (
     Coverage,
     HandEye,
     Intrinsics,

@@ -23,7 +23,7 @@ from service.core.recorded_devices import CameraBodies, bodies, recorded_report
 from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.core.text.words import counted
 from service.core.units import megabytes, ms, um
-from service.jobs.words import term
+from service.jobs import term
 from service.steps.notes import deidentified
 from service.store.verification.verify import AuditReport
 

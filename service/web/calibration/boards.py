@@ -24,7 +24,7 @@ from service.core.protocol.models import CalibrationBoard as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.text.words import counted
 from service.core.units import deg, metres, mm
-from service.jobs.calibration.records import ArmAnswer, HandEye
+from service.jobs.calibration_records import ArmAnswer, HandEye
 from service.jobs.records import Camera
 from service.rig import Rig
 from service.run_record import RunRecord
@@ -36,7 +36,7 @@ from service.steps.plan_preview import preview_board_poses
 from service.web.record.images import recorded_rig_section
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import station_of
-from service.worker.calibration.records import corrected_mounting
+from service.worker.records import corrected_mounting
 
 POSES = 6
 _USUAL_CORNER_PX = 0.1  # 1σ of a board corner, for records that do not state it

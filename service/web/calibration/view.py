@@ -12,8 +12,8 @@ from service.core.protocol.models import Step
 from service.core.recorded_devices import RecordedIdentity, recorded_report
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
 from service.core.run.state import StepState
-from service.jobs.calibration import calibrate
-from service.jobs.calibration.records import ArmAnswer, HandEye, Intrinsics, Residuals
+from service.jobs import calibrate
+from service.jobs.calibration_records import ArmAnswer, HandEye, Intrinsics, Residuals
 from service.jobs.records import Camera
 from service.run_record import RunRecord
 from service.steps.kinds.calibration import Params

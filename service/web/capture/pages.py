@@ -13,7 +13,7 @@ from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
 from service.core.protocol.models import Step
-from service.jobs.capture.live_summary import Suggestion
+from service.jobs.live_summary import Suggestion
 from service.people.control import Control
 from service.people.person import Person
 from service.run_record import RunRecord

@@ -24,7 +24,7 @@ from service.core.protocol.models import Reasons, Step
 from service.core.records.entered import NoteTaken, about_rows
 from service.core.records.events import ArtefactRef, ControlTaken, Event, RunStarted
 from service.dataset.registrations import evaluated, shared_adjustment_note
-from service.jobs.registration.evaluate import Row
+from service.jobs.evaluate import Row
 from service.monitor.snapshot import STALE_S, read_snapshot
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.control import Control

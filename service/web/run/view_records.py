@@ -18,7 +18,7 @@ from service.core.records.events import Event, GateVerdict, OperatorAction, Oper
 from service.core.recovery import planned_views
 from service.core.run.expected import duration
 from service.core.run.state import Deviation, RunState, StepState
-from service.jobs.registration.evaluate import Row
+from service.jobs.evaluate import Row
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
 from service.web.page.run_frame import gate_word, limit
