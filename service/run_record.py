@@ -17,13 +17,13 @@ from service.core.records.events import ArtefactRef, Event, Payload, RecordedVie
 from service.core.run.decide import advance, fold
 from service.core.run.state import JobState, RunState, lane_of
 from service.core.text.words import time_here
+from service.jobs import term
 from service.jobs.memory_grants import waiting_for_memory
-from service.jobs.words import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
 from service.store.database.engine import RESTORE
-from service.store.queue.leases import RunLease
 from service.store.records import NewArtefact, NewJob
+from service.store.runs import RunLease
 from service.store.store import Store
 
 if TYPE_CHECKING:

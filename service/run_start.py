@@ -16,7 +16,7 @@ from service.rig import Rig, RigDevice, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root
 from service.runner.software import software_versions
 from service.steps.protocol_check import require_devices, require_plausible
-from service.store.files.space_used import forecast_of, require_space
+from service.store.disk_space import forecast_of, require_space
 from service.store.records import NewArtefact
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store

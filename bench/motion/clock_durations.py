@@ -34,8 +34,8 @@ from service.monitor.snapshot import (
 from service.steps.context import StepContext
 from service.steps.held_camera import new_images
 from service.store.database.tables import jobs, leases
+from service.store.disk_space import USUAL_AGE_S, remove_leftovers
 from service.store.durable_effects import moment_of
-from service.store.files.leftovers import USUAL_AGE_S, remove_leftovers
 from service.store.records import NewJob
 from service.web.capture.media import live_view
 from service.web.site import Site
@@ -133,7 +133,7 @@ def _file_of_a_runner(world: World, true_s: float) -> Seen:
     put_image(world.store, "v1")
     world.wait(true_s)
     boot_s = boot_time() + world.fault.set_s + world.fault.true_s
-    with patch("service.store.files.leftovers.psutil", SimpleNamespace(boot_time=lambda: boot_s)):
+    with patch("service.store.disk_space.psutil", SimpleNamespace(boot_time=lambda: boot_s)):
         gone = bool(remove_leftovers(world.store, actor="Ada", min_age_s=0))
     assert lease.run_id == run
     if world.fault.boot_monotonic_s is not None:

@@ -10,7 +10,7 @@ from service.people.person import Person
 from service.people.rows import SESSION_S
 from service.people.sessions import FIRST_WAIT_S
 from service.people.tries import failed_tries
-from service.web.security.shield import TRIES_WINDOW_S, Limiter
+from service.web.security import TRIES_WINDOW_S, Limiter
 from tests.support.pages.web import password_of
 from tests.support.record.store import start_run
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.machine import RESULTS, commit, machine
-from service.dataset.preview.records import Preview, read_preview, write_preview
+from service.dataset.preview_records import Preview, read_preview, write_preview
 from tests.support.pages.web import Browser, web_site
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 

@@ -17,8 +17,8 @@ from service.compute.pixels.views import splits
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.geometry import Array, apply, inverse
 from service.core.units import metres
-from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, PosedView
+from service.dataset.pixels import Photographs
+from service.dataset.records import DataSet, Mesh, PosedView
 
 _POINTS = 2000  # of the scan, by which the sparse views are chosen
 

@@ -27,7 +27,7 @@ from service.compute.ground_truth.fuse import Markers, compact
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import inverse
 from service.core.units import metres
-from service.dataset.posed.records import Mesh
+from service.dataset.records import Mesh
 from simulators.scene.world import POST_RADIUS_M
 
 WORK = REPOSITORY / "build" / "bench" / "reconstruction"

@@ -24,7 +24,7 @@ from service.compute.ground_truth.surface import IntArray, Surface
 from service.compute.pixels.render import RayMesh
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm
-from service.dataset.posed.records import DataSet
+from service.dataset.records import DataSet
 
 ANGLES_DEG = (60.0, 70.0, 75.0, 80.0, 87.0)  # between the surface's normal and the ray
 VIEWS = (1, 2, 4)

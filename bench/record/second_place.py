@@ -20,8 +20,7 @@ from bench.machine import RESULTS, commit, machine
 from service.core.records.events import DeviceTrouble
 from service.store.durable_effects import SystemClock
 from service.store.signatures.log import NAME
-from service.store.signatures.log_copy import LogCopy
-from service.store.signatures.second_place import Away, SecondPlace
+from service.store.signatures.second_place import Away, LogCopy, SecondPlace
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until
 from tests.support.record.ailing_place import WAYS, Ailing

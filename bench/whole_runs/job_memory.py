@@ -36,8 +36,8 @@ from service.compute.ground_truth.surface import Surface, read_ply
 from service.compute.resources import keep_freed_memory
 from service.core.records.events import ArtefactRef
 from service.core.units import metres
-from service.jobs.surfaces import coverage_points, ct_surface, fuse, locate_spheres
-from service.store.files.artefacts import hash_file
+from service.jobs import coverage_points, ct_surface, fuse, locate_spheres
+from service.store.artefacts import hash_file
 from service.worker.job import JobAnswer, JobContext, RecordedContext, handler_of
 from simulators.ct_suite.volume import grid_around, voxelise
 from simulators.scan_station.station import scan_scene
@@ -117,7 +117,7 @@ def arguments(folder: Path, name: str) -> dict[str, Any]:
 def score(folder: Path) -> JobAnswer:
     """Score a mesh against the fused one as a benchmark does: the same with noise."""
     from service.benchmark.scoring import score_mesh, write_scored  # noqa: PLC0415 - loads much that jobs do not need
-    from service.dataset.posed.records import Mesh  # noqa: PLC0415
+    from service.dataset.records import Mesh  # noqa: PLC0415
 
     columns, faces = read_ply(folder / "ground_truth.ply")
     vertices = 1e-3 * np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)

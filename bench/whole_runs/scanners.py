@@ -18,7 +18,7 @@ import yaml
 
 from bench.machine import RESULTS, commit, machine
 from bench.whole_runs.whole_run import orthocapture, simulated_rig
-from service.cli.run.demo import true_cameras, true_error_mm
+from service.cli.demo import true_cameras, true_error_mm
 from service.core.run.state import StepState
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run

@@ -18,7 +18,7 @@ import psutil
 
 from bench.machine import REPOSITORY
 from bench.whole_runs.run_figures import run_figures
-from service.cli.run.demo import true_errors_mm
+from service.cli.demo import true_errors_mm
 from service.core.records.events import RunReleased
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run

@@ -26,11 +26,11 @@ from service.compute.ground_truth.chamfer import ChamferSettings
 from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_folder import scaled_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exported import scaled_data_set
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import DataSet
+from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
-from service.store.files.artefacts import hash_file
 
 _LAST_LINES = 12  # of a failed program's output, for the message
 _ANSWER_S = 10.0  # that the NVIDIA driver may take to name its GPU

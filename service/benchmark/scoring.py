@@ -19,7 +19,7 @@ from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm
 from service.dataset.formats.meshes import png
-from service.dataset.posed.records import DataSet, Mesh
+from service.dataset.records import DataSet, Mesh
 
 MARGIN_M = 0.002
 _POINTS = 200_000  # of the truth, by which its box is found

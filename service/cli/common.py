@@ -1,4 +1,4 @@
-"""Shared by all commands: consoles, options, exit statuses for errors, and a progress bar."""
+"""Shared by all commands: consoles, options, exit statuses for errors, a progress bar, and the shipped protocols."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ from rich.table import Table
 from typer.models import OptionInfo
 
 from service.cli.terminal_output import Terminal, bar_of_shares
-from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError
+from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError, ProtocolError
 from service.core.shown_text import shown, shown_json, shown_lines
 
 # The run waits for a decision of a person, and this command had nobody to ask: EX_TEMPFAIL of sysexits.h.
@@ -244,3 +245,31 @@ def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], 
     finally:
         if on_screen:
             bar.stop()
+
+
+_FOLDER = "protocols"
+PROTOCOL_HELP = "The protocol file, or the name of a shipped one, such as exvivo_spine."
+
+
+def shipped_protocols() -> Path:
+    """The folder of the protocols that come with orthocapture."""
+    return Path(str(files(_FOLDER)))
+
+
+def protocol_file(named: Path) -> Path:
+    """The protocol file of this path, or the shipped one of this name if there is no such file.
+
+    `exvivo_spine`, `exvivo_spine.yaml` and `protocols/exvivo_spine.yaml` name the same one, wherever the command is
+    given. Raises ProtocolError, which lists the names, if there is neither.
+    """
+    if named.is_file() or named.parent.as_posix() not in (".", _FOLDER):
+        return named
+    shipped = {path.name: path for path in sorted(shipped_protocols().glob("*.yaml"))}
+    found = shipped.get(named.name) or shipped.get(f"{named.name}.yaml")
+    if found is None:
+        raise ProtocolError(
+            "there is no such file, and no protocol of this name comes with orthocapture",
+            where=str(named),
+            remedy=f"Check the path, or name one of {', '.join(path.stem for path in shipped.values())}",
+        )
+    return found

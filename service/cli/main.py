@@ -32,120 +32,120 @@ class _Command:
 # Imported on demand: `status` need not load the numerics that `register` needs, and `--help` none of them.
 _COMMANDS = {
     "demo": _Command(
-        "service.cli.run.demo:demo_command",
+        "service.cli.demo:demo_command",
         "Run the demonstration protocol on a simulated rig and show the results. Takes a few minutes.",
     ),
     "serve": _Command(
-        "service.cli.site.serve:serve_command",
+        "service.cli.serve:serve_command",
         "Serve the guided screen and the audit. Runs continue when this command ends; stop them on the screen.",
     ),
     "run": _Command(
-        "service.cli.run.commands:run_command",
+        "service.cli.run:run_command",
         "Run a protocol step by step. Nothing moves before you have confirmed it.",
     ),
     "resume": _Command(
-        "service.cli.run.commands:resume_command",
+        "service.cli.run:resume_command",
         "Continue a run after a crash, a power failure or a pause; nothing captured is lost or taken twice.",
     ),
     "import": _Command(
-        "service.cli.run.import_command:import_command",
+        "service.cli.import_command:import_command",
         "Import photographs, scan and CT that were captured earlier; register and evaluate them as a run.",
     ),
     "act": _Command(
-        "service.cli.run.act:act_command",
+        "service.cli.act:act_command",
         "Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist.",
     ),
     "draw-region": _Command(
-        "service.cli.run.act:draw_region_command",
+        "service.cli.act:draw_region_command",
         "Draw a region in which the CT or the scan counts; the next fusion uses it, as one drawn on the 3D view.",
     ),
     "cancel": _Command(
-        "service.cli.run.cancel:cancel_command",
+        "service.cli.act:cancel_command",
         "End one computation of a run. The step that waits for it asks what to do, as if it had failed.",
     ),
     "note": _Command(
-        "service.cli.run.act:note_command",
+        "service.cli.act:note_command",
         "Write a note on a step of a run, with or without a photograph; the run goes on as it was.",
     ),
-    "status": _Command("service.cli.run.status:status_command", "Show the state of a run: steps, gates, deviations."),
+    "status": _Command("service.cli.status:status_command", "Show the state of a run: steps, gates, deviations."),
     "runs": _Command(
-        "service.cli.evidence.runs:runs_command", "List the recorded runs, newest first: all, or those that match."
+        "service.cli.runs:runs_command", "List the recorded runs, newest first: all, or those that match."
     ),
     "compare": _Command(
-        "service.cli.evidence.runs:compare_command",
+        "service.cli.runs:compare_command",
         "Compare two runs: protocol, gates, figures, accuracy, calibration, durations, deviations.",
     ),
     "history": _Command(
-        "service.cli.evidence.runs:history_command",
+        "service.cli.runs:history_command",
         "Print calibration and accuracy over time for each camera, lens and arm, as CSV.",
     ),
     "worker": _Command(
-        "service.cli.site.worker:worker_command",
+        "service.cli.worker:worker_command",
         "Compute jobs: calibration, spheres, structure from motion, registration; one job per core at once.",
     ),
     "doctor": _Command(
-        "service.cli.site.doctor:doctor_command",
+        "service.cli.doctor:doctor_command",
         "Open every device of a rig; report versions, clock offsets, free space and problems.",
     ),
     "dicom-listen": _Command(
-        "service.cli.site.dicom_listen:dicom_listen_command",
+        "service.cli.dicom_listen:dicom_listen_command",
         "Receive CT series and segmentations that a CT suite sends (DICOM C-STORE), until it is terminated.",
     ),
     "calibrate": _Command(
-        "service.cli.calibrate.group:calibrate_app", "Calibrate a camera and its mounting from images of a board."
+        "service.cli.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
     ),
     "import-ros": _Command(
-        "service.cli.compute.import_ros:import_ros_command",
+        "service.cli.import_ros:import_ros_command",
         "Take images, robot poses, camera and mount from a ROS 2 recording; the files fit the other commands.",
     ),
     "develop": _Command(
-        "service.cli.compute.develop:develop_command",
+        "service.cli.develop:develop_command",
         "Develop raw files to linear TIFFs of 16 bits, always in the same way; needs the extra `raw`.",
     ),
     "sfm": _Command(
-        "service.cli.compute.sfm:sfm_command",
+        "service.cli.sfm:sfm_command",
         "Estimate camera poses with fixed, calibrated intrinsics; use the model with register --estimate-scale.",
     ),
     "register": _Command(
-        "service.cli.compute.register:register_command",
+        "service.cli.register:register_command",
         "Register posed images with a scan by the spheres visible in both, and report the accuracy.",
     ),
     "spheres": _Command(
-        "service.cli.compute.spheres:spheres_command",
+        "service.cli.spheres:spheres_command",
         "Find every sphere of a given radius in a mesh or point cloud, with its covariance and fit.",
     ),
     "layout": _Command(
-        "service.cli.compute.layout:layout_command",
+        "service.cli.layout:layout_command",
         "Check how well the spheres can be told apart, and suggest which to move. Exit status 1: some must be moved.",
     ),
     "fuse": _Command(
-        "service.cli.compute.fuse:fuse_command",
+        "service.cli.fuse:fuse_command",
         "Fuse a CT mesh and a scan: the CT in the wound, the scan outside, blended between.",
     ),
     "evaluate": _Command(
-        "service.cli.compute.evaluate:evaluate_app", "Compare a reconstructed surface with the ground truth."
+        "service.cli.evaluate:evaluate_app", "Compare a reconstructed surface with the ground truth."
     ),
-    "benchmark": _Command("service.cli.benchmark.group:benchmark_app", "Compare methods on an exported data set."),
+    "benchmark": _Command("service.cli.benchmark:benchmark_app", "Compare methods on an exported data set."),
     "simulate": _Command(
-        "service.cli.site.simulate:simulate_command",
+        "service.cli.simulate:simulate_command",
         "Start a simulated device (ur, kuka, camera, gige and others) or a whole rig, until it is terminated.",
     ),
     "audit": _Command(
-        "service.cli.evidence.audit:audit_app",
+        "service.cli.audit:audit_app",
         "Show, verify, sign, report and export the recorded evidence of a run.",
     ),
-    "store": _Command("service.cli.evidence.store:store_app", "Maintain the folder that holds the evidence."),
+    "store": _Command("service.cli.store:store_app", "Maintain the folder that holds the evidence."),
     "replay": _Command(
-        "service.cli.evidence.replay:replay_command",
+        "service.cli.replay:replay_command",
         "Compute calibration, registration and evaluation again from the recorded files, and compare.",
     ),
     "export": _Command(
-        "service.cli.evidence.export:export_command",
+        "service.cli.export:export_command",
         "Write the data set of a completed run in a format that others read: images, poses, depth, masks, mesh.",
     ),
-    "accounts": _Command("service.cli.site.accounts:accounts_app", "Maintain the accounts of a site."),
-    "protocol": _Command("service.cli.site.protocol:protocol_app", "Check a protocol file before it is used."),
-    "plan": _Command("service.cli.site.plan:plan_app", "Plan viewpoints, before and during a capture."),
+    "accounts": _Command("service.cli.accounts:accounts_app", "Maintain the accounts of a site."),
+    "protocol": _Command("service.cli.protocol:protocol_app", "Check a protocol file before it is used."),
+    "plan": _Command("service.cli.plan:plan_app", "Plan viewpoints, before and during a capture."),
 }
 # Under which heading the help lists each command; the order is that of the help.
 _GROUPS = {

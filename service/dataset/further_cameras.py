@@ -16,8 +16,8 @@ from service.core.records.events import ArtefactRef, FurtherExposure, RecordedVi
 from service.core.run.state import RunState
 from service.core.units import mm, mrad
 from service.dataset.registrations import further_cameras
+from service.jobs.further_camera import Answer
 from service.jobs.records import Matrix
-from service.jobs.registration.further_camera import Answer
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ with the smallest predicted error is shown (`best_registration`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 from pydantic import ValidationError
@@ -18,11 +19,10 @@ from service.core.gates.release import late_words
 from service.core.protocol.models import Protocol
 from service.core.protocol.step_params import Gives
 from service.core.run.state import JobState, RunState, lane_of
+from service.jobs import evaluate, further_camera, register, structure_from_motion
+from service.jobs.evaluate import ErrorBudget, Row
 from service.jobs.kind import JobRecord
-from service.jobs.poses import structure_from_motion
-from service.jobs.registration import evaluate, further_camera, register
-from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Registration, Registrations
+from service.jobs.register import Registration, Registrations
 
 _R = TypeVar("_R", bound=JobRecord)
 
@@ -194,3 +194,48 @@ def _finished(protocol: Protocol, state: RunState, gives: Gives, job_kind: str) 
         if step.gives == gives:
             jobs = state.steps[step.id].jobs.values()
             yield from ((step.id, job) for job in jobs if job.kind == job_kind and job.status == "finished")
+
+
+# Results that arrived after the evaluation, and what they add to its table.
+#
+# A registration that arrives late never replaces the run's own (registrations.py). Every reader is still told that
+# it arrived, when, and whether it is better.
+
+
+@dataclass(frozen=True, slots=True)
+class LateResult:
+    """One row of the evaluation's table that arrived after the evaluation was made."""
+
+    seq: int  # of the event that brought it
+    at_utc: str
+    step: str
+    name: str  # of the registration
+    text: str
+
+
+def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
+    """Every late result of a run, in order of arrival; empty before the evaluation."""
+    own = own_registration(protocol, state)
+    before = signed_rows(protocol, state)
+    if own is None:
+        return []
+    mine = next(row for row in before if row.poses == own)
+    known = {row.poses for row in before}
+    found: list[LateResult] = []
+    for step, job in later_evaluations(protocol, state):
+        for row in evaluate.KIND.read_answer(job.result).table:
+            name = row.poses
+            if name not in known:
+                known.add(name)
+                text = f"{name}: {arrived(protocol, state, job)}. {_changed(row, mine)}"
+                found.append(LateResult(job.ended_seq, job.ended_utc, step, name, text))
+    return sorted(found, key=lambda result: result.seq)
+
+
+def _changed(row: Row, own: Row) -> str:
+    error_mm, own_mm = row.mean_radial_error_mm, own.mean_radial_error_mm
+    better = "better than" if error_mm < own_mm else "not better than"
+    return (
+        f"It adds a row to the table, with a mean radial error of {error_mm:.3f} mm: {better} the run's own, "
+        f"{own.poses} with {own_mm:.3f} mm, which stays the one that was judged and signed"
+    )

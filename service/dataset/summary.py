@@ -1,9 +1,10 @@
-"""A finished or stopped run, as the report and the data set need it, read from the evidence alone."""
+"""Sums up a finished or stopped run from its evidence alone, as report and data set need it, with its fusion."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from typing import Protocol as Interface
@@ -12,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.surface import read_ply
-from service.core.errors import DataError
-from service.core.geometry import Array
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, align_points, apply
 from service.core.protocol.models import Protocol
 from service.core.records.events import ArtefactRef, Event, JobFinished, RecordedView, RunStarted
 from service.core.run.fold import fold
-from service.core.run.state import RunState
+from service.core.run.state import JobState, RunState
 from service.core.units import metres
-from service.dataset.registered_scan import registered_scan
 from service.dataset.registrations import (
     better_later,
     budgets,
@@ -28,10 +28,27 @@ from service.dataset.registrations import (
     registrations,
     result_of_step,
 )
+from service.jobs import fuse
+from service.jobs.evaluate import ErrorBudget, Row
 from service.jobs.records import Point, SpheresFound
-from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Registration
+from service.jobs.register import Registration
 from service.store.store import Store
+
+
+def registered_scan(protocol: Protocol, state: RunState) -> str:
+    """The step whose scan the last registration used; before there is one, the last scan; "" without any."""
+    scans = [step.id for step in reversed(protocol.steps) if step.gives == "scan_surface"]
+    for step in reversed(protocol.steps):
+        if step.gives == "registrations" and state.steps[step.id].result:
+            named = str(step.params.model_dump().get("scan") or "")
+            return named if named in scans else ""
+    return next((step for step in scans if state.steps[step].result), "")
+
+
+def control_scan(protocol: Protocol) -> str:
+    """The step whose scan still shows the control spheres, as the last evaluation names it; "" without any."""
+    judged = next((step for step in reversed(protocol.steps) if step.gives == "accuracy"), None)
+    return "" if judged is None else str(judged.params.model_dump().get("control_scan") or "")
 
 
 class ArtefactReader(Interface):
@@ -148,3 +165,65 @@ def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:
     root = events[0].payload
     assert isinstance(root, RunStarted)  # service.run_start has checked it
     return RunSummary(run_id, protocol, root, fold(protocol, events), events, store)
+
+
+MESH = "ground_truth_mesh"  # kind of the mesh's artefact
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFusion:
+    """What the record says of the fusion from which the data set's mesh comes.
+
+    Attributes:
+        step: title of its step.
+        answer: of the job.
+        measures: of the job, by name.
+        spacing_m: of the samples for its Chamfer distance.
+        files: its artefacts by kind.
+    """
+
+    step: str
+    answer: fuse.Answer
+    measures: Mapping[str, float]
+    spacing_m: float
+    files: Mapping[str, ArtefactRef] = field(repr=False)
+
+
+def recorded_fusion(summary: RunSummary) -> RecordedFusion | None:
+    """The fusion whose mesh is the run's ground truth; None if that is the scan.
+
+    Raises:
+        DataError: the job that made the mesh is not in the record.
+    """
+    meshes = summary.artefacts(MESH)
+    if not meshes:
+        return None
+    for step in reversed(summary.protocol.steps):
+        for job in summary.state.steps[step.id].jobs.values():
+            files = {ref.kind: ref for ref in job.artefacts}
+            if job.kind == fuse.KIND.name and files.get(MESH) == meshes[-1]:
+                return _read(step.title, job, files)
+    raise DataError("no recorded job made the ground truth's mesh", where=summary.run_id)
+
+
+def _read(step: str, job: JobState, files: Mapping[str, ArtefactRef]) -> RecordedFusion:
+    spacing_m = float(job.arguments["spacing_m"])
+    return RecordedFusion(step, fuse.KIND.read_answer(job.result), job.measures, spacing_m, files)
+
+
+@lru_cache(maxsize=16)
+def control_centres(scan: tuple[Point, ...], control: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Centres that only the control scan shows, in the frame of the scan."""
+    if not scan or not control:
+        return ()
+    from service.compute.surfaces.constellations import match_constellations  # noqa: PLC0415 - loads scipy
+
+    a, b = np.array(scan), np.array(control)
+    try:
+        found = match_constellations(a, b)
+    except ComputeError:
+        return ()
+    pairs = np.array(found.pairs)
+    T_a_b, _ = align_points(a[pairs[:, 0]], b[pairs[:, 1]])
+    extra: Array = apply(T_a_b, b[list(found.missing_b)]) if found.missing_b else np.zeros((0, 3))
+    return tuple((float(x), float(y), float(z)) for x, y, z in extra)

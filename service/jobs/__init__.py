@@ -1,4 +1,4 @@
-"""Kinds of jobs, declared once for steps, worker, audit and web; and the list of all kinds."""
+"""Kinds of jobs, declared once for steps, worker, audit and web; the list of all kinds, and their words."""
 
 from __future__ import annotations
 
@@ -21,3 +21,13 @@ def job_kinds() -> Mapping[str, JobKind[Any, Any]]:
             when they are listed.
     """
     return KindsOnDemand[JobKind[Any, Any]](__name__, GROUP, JobKind, lambda kind: (kind.order, kind.name))
+
+
+# Of names that are not job kinds; each job kind declares its own words.
+_WORDS: Mapping[str, str] = {"ct": "CT series", "control_image": "images of the control spheres"}
+
+
+def term(name: str) -> str:
+    """Words for a name in the records: `CT surface` for ct_surface; an unknown name with spaces."""
+    kind = job_kinds().get(name)
+    return kind.words if kind is not None else _WORDS.get(name, name.replace("_", " "))

@@ -25,7 +25,7 @@ from service.core.errors import ComputeError
 from service.core.records.events import Record
 from service.core.units import megabytes
 from service.store.durable_effects import Clock
-from service.store.queue.leases import ProcessIdentity
+from service.store.runs import ProcessIdentity
 
 _RESERVE_MB = 400.0  # for what else runs on the machine
 _POLL_S = 0.5

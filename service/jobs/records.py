@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pydantic import Field
 
 from service.core.records.events import Uncertainty
+from service.core.run.state import JobState
 from service.jobs.kind import JobRecord
 
 Matrix = tuple[tuple[float, ...], ...]  # row by row
@@ -274,3 +275,8 @@ class ParameterCovariance(JobRecord):
 
     parameters: tuple[str, ...]
     matrix: Matrix
+
+
+def image_of(job: JobState) -> ImageFile:
+    """The photograph that such a job was given. Raises ValidationError for a job of another kind."""
+    return ImageFile.model_validate(job.arguments["image"])

@@ -25,7 +25,7 @@ from service.store.database.tables import event_index, events, jobs, runs
 from service.store.durable_effects import Clock
 from service.store.events import parse_canonical
 from service.store.records import SITE
-from service.store.run_rows import read_open_runs
+from service.store.runs import read_open_runs
 from service.store.signatures.second_place import Away
 from service.store.store import Store
 

@@ -1,1 +1,1 @@
-"""Drives a run: the loop, the execution of a step, and separately lease, foot pedal, disk, clocks and signatures."""
+"""Drives a run: the loop, the execution of a step, the leave to move, the foot pedal, and the upkeep besides."""

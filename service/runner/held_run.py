@@ -11,7 +11,7 @@ from service.core.protocol.models import Protocol
 from service.core.records.events import Payload
 from service.core.run.state import RunState
 from service.run_record import RunFollower
-from service.store.queue.leases import RunLease
+from service.store.runs import RunLease
 from service.store.store import Store
 
 _LEASE_S = 30.0

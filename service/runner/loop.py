@@ -42,17 +42,13 @@ from service.core.run.expected import tries_words
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.monitor.host import host_clock
-from service.runner.clocks import ClockWatch
-from service.runner.disk import DiskWatch
 from service.runner.execution import Starvation, StepExecution, WorkerWatch, held_up_here
 from service.runner.held_run import HeldRun, held_run
 from service.runner.leave import LeaveWatch
-from service.runner.memory import short_collections
 from service.runner.operator import AnswerBy, Operator
 from service.runner.pedal import Pedal
-from service.runner.sealing import Seal
 from service.runner.software import software_versions
-from service.runner.trouble import PASSING, RecordTrouble
+from service.runner.upkeep import PASSING, ClockWatch, DiskWatch, RecordTrouble, Seal, short_collections
 from service.steps.context import Devices
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority

@@ -10,10 +10,9 @@ from typing import Any
 from service.core.jobs import Jobs, Reference, job_key, jobs_of, newest_job
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import LATER, WAITED, RunState
+from service.jobs import detect_spheres, evaluate, features, hybrid, match, register, structure_from_motion
 from service.jobs.kind import JobRecord, read_part
-from service.jobs.poses import features, hybrid, match, structure_from_motion
 from service.jobs.records import Camera, ImageFile
-from service.jobs.registration import detect_spheres, evaluate, register
 from service.steps.context import JobRequest
 from service.steps.front_end import early_matches
 from service.steps.registration_jobs import RegistrationJobs, Task, name_of, recorded_registration_jobs

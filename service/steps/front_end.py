@@ -19,10 +19,9 @@ from service.core.jobs import Jobs, job_key
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import EARLY, JobState, RunState
-from service.jobs.calibration import calibrate
+from service.jobs import calibrate, features, match
+from service.jobs.features import FrontEndArguments, SfmEffort
 from service.jobs.kind import read_part
-from service.jobs.poses import features, match
-from service.jobs.poses.features import FrontEndArguments, SfmEffort
 from service.jobs.records import Camera, ImageFile
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import EarlierAnswer, earlier_answer

@@ -10,8 +10,8 @@ from service.compute.images.develop_parameters import PARAMETERS
 from service.core.jobs import Reference
 from service.core.records.events import FurtherExposure, ViewpointCaptured
 from service.core.run.state import JobState
+from service.jobs import develop, further_camera
 from service.jobs.records import ImageFile
-from service.jobs.registration import develop, further_camera
 from service.steps.context import JobRequest, JobResult, StepContext
 from service.steps.inputs import raw_of
 from service.steps.registration_sources import most_preferred

@@ -16,11 +16,8 @@ from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, 
 from service.core.records.events import Record, ViewHeld
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
-from service.jobs.calibration import calibrate
-from service.jobs.capture import hand_board, hand_view
-from service.jobs.looks import image_of
-from service.jobs.records import Limits, Point
-from service.jobs.surfaces import coverage_points, layout
+from service.jobs import calibrate, coverage_points, hand_board, hand_view, layout
+from service.jobs.records import Limits, Point, image_of
 from service.steps.context import JobRequest, StepContext, StepOutcome
 from service.steps.exposure import wanted_settings
 from service.steps.inputs import artefact_of, earlier_answer, held_views, intrinsics_covariance_of

@@ -13,11 +13,17 @@ from service.core.jobs import Each, Reference, answered_by
 from service.core.records.events import ArtefactRef, RecordedView, ViewHeld, ViewpointCaptured
 from service.core.run.state import JobState
 from service.core.text.words import counted
-from service.jobs.calibration import calibrate
-from service.jobs.capture import hand_board, hand_view
+from service.jobs import calibrate, hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.looks import image_of
-from service.jobs.records import ArmCorrection, FurtherArm, Matrix, Mounting, ParameterCovariance, PosedPhotograph
+from service.jobs.records import (
+    ArmCorrection,
+    FurtherArm,
+    Matrix,
+    Mounting,
+    ParameterCovariance,
+    PosedPhotograph,
+    image_of,
+)
 from service.steps.context import StepContext
 
 R = TypeVar("R", bound=JobRecord)
@@ -195,7 +201,7 @@ class CameraMounting:
 
 
 def mounting_of(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> CameraMounting:
-    """What turns robot poses into camera poses (service/worker/poses/robot_poses.py).
+    """What turns robot poses into camera poses (service/worker/inputs.py).
 
     A correction belongs to one arm: it is given with the stations at which that arm stood.
 

@@ -18,11 +18,8 @@ from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, 
 from service.core.records.events import FurtherExposure, Record, RecordedView, ViewpointCaptured
 from service.core.run.state import LIVE, JobState
 from service.core.units import metres, rad_of_mrad
-from service.jobs.calibration import calibrate
-from service.jobs.capture import further_view, live_summary, live_view
-from service.jobs.looks import image_of
-from service.jobs.records import Camera, Hash, ImageFile, Limits, Matrix, Mounting, Point, PosedPhotograph
-from service.jobs.surfaces import coverage_points, locate_spheres
+from service.jobs import calibrate, coverage_points, further_view, live_summary, live_view, locate_spheres
+from service.jobs.records import Camera, Hash, ImageFile, Limits, Matrix, Mounting, Point, PosedPhotograph, image_of
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, earlier_answer, mounting_of, with_robot_pose
 from service.steps.notes import SPOILT, SUGGESTION, suggested_views

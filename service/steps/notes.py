@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.core.run.state import StepState
 from service.core.text.words import counted
-from service.jobs.capture.live_summary import Suggestion
+from service.jobs.live_summary import Suggestion
 from service.jobs.records import Matrix
 
 BOARD_POSES, SUGGESTION = "board_poses", "suggested_viewpoints"

@@ -16,12 +16,11 @@ from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.jobs import Reference, arguments_name, jobs_of, newest_job, resolve
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import LATER, REDUCED, WAITED, JobState, RunState
-from service.jobs import job_kinds
+from service.jobs import detect_spheres, job_kinds
+from service.jobs.features import ImagesToMatch
 from service.jobs.kind import JobRecord, read_part
-from service.jobs.poses.features import ImagesToMatch
-from service.jobs.poses.match import PairsToMatch
+from service.jobs.match import PairsToMatch
 from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
-from service.jobs.registration import detect_spheres
 from service.steps.context import JobRequest
 from service.steps.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
 from service.steps.registration_sources import PLANNED, QUICK, WantedRegistrations, decisive, posed

@@ -8,9 +8,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from service.core.protocol.models import Protocol, Step
-from service.jobs.poses.features import SfmEffort
+from service.jobs.features import SfmEffort
 from service.jobs.records import PosedPhotograph
-from service.jobs.registration.register import ARM
+from service.jobs.register import ARM
 
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
 # hand-eye calibration estimated them, and each pose's error as the spheres show it. "spheres" locates each image of a

@@ -9,7 +9,7 @@ from service.core.errors import ImagesSpoiltError
 from service.core.gates.verdict import describe, evaluate_gates
 from service.core.records.events import RecordedView
 from service.core.run.state import JobState
-from service.jobs.looks import image_of
+from service.jobs.records import image_of
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING, SPOILT, images_to_repeat
 

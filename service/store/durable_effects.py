@@ -6,9 +6,11 @@ import os
 import secrets
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import Lock
 from typing import Protocol
 
 from service.core.records.base import Moment
@@ -232,3 +234,43 @@ class RandomIds:
     def new_token(self) -> str:
         """An unguessable token of 32 hexadecimal digits."""
         return secrets.token_hex(16)
+
+
+_KEPT = 10_000  # times that are remembered, the newest
+
+
+class Ages:
+    """How old a time in UTC is at least and at most.
+
+    When this process first meets a time, it keeps its age by UTC. From then on the monotonic clock says how much
+    older it has become, beside UTC. The host's clock may be set meanwhile, and the host may sleep; of the two ages
+    the smaller says how long somebody has surely waited, the larger how old something may be. A new process begins
+    with UTC, so that a restart of the host is bridged.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._met: OrderedDict[float, tuple[float, float]] = OrderedDict()  # time → its age then, monotonic time then
+        self._lock = Lock()
+
+    def begin(self, since_utc_s: float) -> None:
+        """Meet a time that is being recorded, so that both clocks count from now on."""
+        self._both(since_utc_s)
+
+    def at_least_s(self, since_utc_s: float) -> float:
+        """The age in seconds that has surely passed; negative before the time has come."""
+        return min(self._both(since_utc_s))
+
+    def at_most_s(self, since_utc_s: float) -> float:
+        """The largest age in seconds that it may have; negative before the time has come."""
+        return max(self._both(since_utc_s))
+
+    def _both(self, since_utc_s: float) -> tuple[float, float]:
+        """The age by UTC and that by the monotonic clock."""
+        age_s, now_s = self._clock.utc_s() - since_utc_s, self._clock.monotonic_s()
+        with self._lock:
+            age_then_s, then_s = self._met.setdefault(since_utc_s, (age_s, now_s))
+            self._met.move_to_end(since_utc_s)
+            while len(self._met) > _KEPT:
+                self._met.popitem(last=False)
+        return age_s, age_then_s + now_s - then_s

@@ -1,4 +1,4 @@
-"""Records that callers pass to the store and get back from it, other than events: artefacts, jobs, signatures."""
+"""Records that callers pass to the store and get back from it, other than events, and the errors of the store."""
 
 from __future__ import annotations
 
@@ -6,8 +6,38 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.core.errors import StoreError
 from service.core.records.events import ArtefactRef
 from service.core.run.state import WAITED
+
+
+class UnknownRunError(StoreError):
+    """No run, or more than one, matches this name."""
+
+
+class LeaseHeldError(StoreError):
+    """Another process drives this run."""
+
+
+class LeaseLostError(StoreError):
+    """The lease on a run or a job now belongs to another process; nothing was written."""
+
+
+class StoreVersionError(StoreError):
+    """The database was written by another version of the software."""
+
+
+class RecordDamagedError(StoreError):
+    """Database and journal no longer agree: one of them was overwritten, cut, replaced or removed."""
+
+
+class SigningKeyError(StoreError):
+    """The private key that signs checkpoints is missing, unusable or readable by others; the record is unaffected."""
+
+
+class TimestampError(StoreError):
+    """A time-stamp authority cannot be reached or its answer does not verify; the evidence is valid without it."""
+
 
 SITE = "site"  # name of the chain for events outside runs: sign-ins, accounts, keys, starts
 

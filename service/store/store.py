@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -15,8 +16,9 @@ from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
 from service.core.run.state import Lane
 from service.core.shown_text import storable
+from service.store import jobs as queue
 from service.store.access import close_to_others, require_access
-from service.store.ages import Ages
+from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
 from service.store.database.engine import (
     DATABASE_NAME,
     LOOK,
@@ -27,19 +29,33 @@ from service.store.database.engine import (
     open_database,
 )
 from service.store.database.tables import artefacts, events, heads, runs
-from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
-from service.store.errors import UnknownRunError
+from service.store.durable_effects import Ages, Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.events import append, read_events, to_event
-from service.store.files.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
-from service.store.logged_events import tell
 from service.store.mounts import require_own_mount
-from service.store.queue import jobs as queue
-from service.store.queue.leases import RunLease, acquire, check_lease, held_runs, is_held
-from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
-from service.store.run_rows import begin_chain, read_open_runs, read_runs, resolve_run
+from service.store.records import (
+    SITE,
+    Artefact,
+    Checkpoint,
+    Job,
+    NewArtefact,
+    NewJob,
+    RunRow,
+    Timestamp,
+    UnknownRunError,
+)
+from service.store.runs import (
+    RunLease,
+    acquire,
+    begin_chain,
+    check_lease,
+    held_runs,
+    is_held,
+    read_open_runs,
+    read_runs,
+    resolve_run,
+)
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
-from service.store.signatures.log import SignatureLog
-from service.store.signatures.seen import SeenSignatures
+from service.store.signatures.log import SeenSignatures, SignatureLog
 
 _HEAD = select(heads.c.seq).where(heads.c.run_id == bindparam("run"))  # put together once, for they are asked often
 _RUN = select(runs.c.run_id).where(runs.c.run_id == bindparam("run"))
@@ -441,3 +457,23 @@ class Store:
         """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
         with self._database.writing() as connection:
             queue.release(connection, pids)
+
+
+_log = logging.getLogger(__name__)
+_FIELDS = ("step", "attempt", "viewpoint", "device", "job", "job_kind", "duration_s", "note", "error")
+
+
+def tell(events: Sequence[Event]) -> None:
+    """Log one line per event: its kind, number and actor, what it concerns, and an error's message."""
+    if not _log.isEnabledFor(logging.INFO):
+        return
+    for event in events:
+        payload = event.payload
+        said = {name: getattr(payload, name) for name in _FIELDS if getattr(payload, name, None) is not None}
+        words = getattr(payload, "message", None)
+        _log.info(
+            "%s",
+            payload.kind,
+            extra={"run": event.run_id, "seq": event.seq, "actor": event.actor, **said}
+            | ({"words": words} if words else {}),
+        )

@@ -1,7 +1,10 @@
-"""What every page works on: the data folder, the rig, the people, and the runners started from here."""
+"""What every page works on: the data folder, the rig, the people, and the runners that are started from here."""
 
 from __future__ import annotations
 
+import contextlib
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,16 +13,71 @@ from typing import Annotated, cast
 from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
+from fastapi import Path as UrlPath
 
+from service.core.errors import ConfigurationError
 from service.core.run.expected import EarlierTimes
+from service.monitor.snapshot import Snapshot, log_path, write_snapshot
 from service.people.sessions import People
 from service.rig import Rig, RigDevice
 from service.run_record import RunFollower, RunRecord
-from service.run_start import recorded_run, second_place
+from service.run_start import recorded_run, require_rig_free, second_place
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
-from service.web.launch import Launcher
-from service.web.server.open_streams import OpenStreams
+from service.web.connections import OpenStreams
+
+
+@dataclass
+class Launcher:
+    """Runners of one data folder. Whether one lives is asked of the database: it may have another parent."""
+
+    data: Path
+    store: Store
+    _children: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict[str, "subprocess.Popen[bytes]"])
+    _lock: Lock = field(default_factory=Lock)
+
+    def driven(self, run_id: str) -> bool:
+        """Whether a living process drives the run, or one has just been started to do so."""
+        with self._lock:
+            child = self._children.get(run_id)
+            if child is not None and child.poll() is None:
+                return True
+        return self.store.driven(run_id)
+
+    def driven_runs(self) -> list[str]:
+        """All runs of which `driven` is true, by name."""
+        with self._lock:
+            started = {run_id for run_id, child in self._children.items() if child.poll() is None}
+        return sorted(started.union(self.store.driven_runs()))
+
+    def start(self, run_id: str) -> None:
+        """Start a runner. Raises ConfigurationError when the run has one, or it cannot be started."""
+        if self.driven(run_id):
+            raise ConfigurationError("a process drives this run already", where=run_id, remedy="Reload the page")
+        _, root = recorded_run(self.store, run_id)
+        require_rig_free(self.store, Path(root.rig.original_name), run_id=run_id)
+        log = log_path(self.data, run_id)
+        command = [sys.executable, "-m", "service.cli.main", "resume", run_id, "--data", str(self.data), "--screens"]
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with log.open("ab") as output:
+                child = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    start_new_session=True,  # neither Ctrl-C nor the end of this process reaches it
+                )
+        except OSError as error:
+            raise ConfigurationError(
+                f"the process that drives the run cannot be started: {error.strerror or error}", where=str(log)
+            ) from error
+        with self._lock:
+            self._children[run_id] = child
+        now_s = self.store.clock.utc_s()
+        first = Snapshot(at_utc_s=now_s, pid=child.pid, doing="starting", activity="starting", activity_utc_s=now_s)
+        with contextlib.suppress(OSError):  # the runner will report by itself soon
+            write_snapshot(self.data, run_id, first)
 
 
 @dataclass
@@ -97,3 +155,4 @@ def _site(request: Request) -> Site:
 
 
 CurrentSite = Annotated[Site, Depends(_site)]
+RunId = Annotated[str, UrlPath(max_length=64)]

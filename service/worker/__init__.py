@@ -1,1 +1,1 @@
-"""The registration worker: claims jobs, computes, appends results. One folder for each stage of the computation."""
+"""The registration worker: claims jobs, computes, appends results. A job, or jobs that share much, have a file."""

@@ -18,13 +18,11 @@ from typing import TYPE_CHECKING
 from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.run.state import Lane
-from service.jobs import job_kinds
+from service.jobs import job_kinds, term
 from service.jobs.kind import Demand
 from service.jobs.memory_grants import MemoryGrants
-from service.jobs.words import term
 from service.logs.file_log import at
-from service.store.errors import LeaseLostError
-from service.store.records import Job
+from service.store.records import Job, LeaseLostError
 from service.store.store import Store
 from service.worker.job import Handler, JobAnswer, JobContext, handler_of
 

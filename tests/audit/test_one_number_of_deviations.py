@@ -11,17 +11,16 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import export_bundle
-from service.audit.bundle.report import bundle_report
+from service.audit.bundle.export import bundle_report, export_bundle
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
+from service.audit.report.output import render_html
 from service.cli.main import app
 from service.core.run.fold import fold
 from service.core.run.state import Deviation
 from service.core.text.words import counted
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.run_data_set import data_set_of
 from service.run_start import recorded_run
 from service.store.verification.verify import verify
 from tests.support.pages.browsed_run import words

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from service.audit.record.run import read_run
 from service.audit.replay.differences import compare_data, compare_files
-from service.audit.replay.replay import replay
-from service.audit.replay.results import ReplayReport
+from service.audit.replay.replay import ReplayReport, replay
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.jobs import Reference, jobs_of, references_in, resolve

@@ -12,7 +12,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set, scene
 
 CENTRE_M = np.array([0.0, 0.03, 0.025])  # of the box of the solid

@@ -14,7 +14,7 @@ from service.benchmark.programs.colmap import reconstruct, triangulate
 from service.compute.pixels.render import RayMesh
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
-from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.exporter import exporter, write_data_set
 from tests.support.scenes.slab_data_set import slab_data_set, slab_mesh, slab_scene
 
 

@@ -21,9 +21,9 @@ from service.benchmark.table import figure_png, table_markdown, table_record
 from service.compute.ground_truth.chamfer import ChamferSettings
 from service.core.errors import ComputeError, ConfigurationError, DataError, OrthocaptureError
 from service.core.geometry import apply, inverse
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_folder import data_set_of_folder, scaled_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exported import data_set_of_folder, scaled_data_set
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import DataSet
 from tests.support.processes import reconstruction_stand_in
 from tests.support.scenes.posed import posed_data_set, scene
 

@@ -11,7 +11,7 @@ import trimesh
 from bench.reconstruction.specimen import score_specimen, specimen_of
 from service.compute.ground_truth.fuse import Markers
 from service.compute.ground_truth.surface import Surface, write_ply
-from service.dataset.posed.records import Mesh
+from service.dataset.records import Mesh
 
 CENTRE_M = np.array([0.0, 0.0, 0.03])
 UP = np.array([0.0, 0.0, 1.0])

@@ -17,7 +17,7 @@ from service.compute.stereo.matching import depth_of_pair, guided_depth
 from service.compute.stereo.rectify import StereoView, looked_at_m, rectified, stereo_pairs
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at
-from service.dataset.posed.records import DataSet
+from service.dataset.records import DataSet
 from tests.support.scenes.depth_of_sphere import depth_of_sphere
 from tests.support.scenes.slab_data_set import slab_data_set, slab_mesh, slab_scene
 from tests.support.scenes.textured_scene import render

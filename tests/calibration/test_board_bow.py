@@ -21,8 +21,8 @@ from service.compute.intrinsics.uncertainty import (
     projection_uncertainty,
 )
 from service.core.geometry import Array, apply, inverse, look_at, transform
-from service.jobs.calibration.records import BoardSeen
-from service.worker.calibration.records import intrinsics_record, seen_board
+from service.jobs.calibration_records import BoardSeen
+from service.worker.records import intrinsics_record, seen_board
 
 BOARD = Board(10, 14, 0.025)
 SMALL = Board(9, 6, 0.02)

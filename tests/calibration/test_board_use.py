@@ -15,7 +15,7 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewJob
-from service.web.record.board_images import board_uses
+from service.web.record.images import board_uses
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.record.core import EYE

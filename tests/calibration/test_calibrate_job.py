@@ -12,7 +12,7 @@ import pytest
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply
-from service.jobs.calibration import calibrate
+from service.jobs import calibrate
 from service.store.store import Store
 from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS

@@ -14,9 +14,16 @@ from typer.testing import CliRunner
 
 from bench.calibration.arm_errors import one as hand_eye_of
 from bench.calibration.arm_errors import seen_from_nominal_flange
-from service.cli.calibrate.group import calibrate_app
+from service.cli.calibrate import calibrate_app
 from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
-from service.compute.arm_kinematics import chain, dh_jacobian, forward, matching_arm, parallel_jacobian, solve_joints
+from service.compute.arm_kinematics import (
+    chain,
+    dh_jacobian,
+    forward,
+    matching_arm,
+    parallel_jacobian,
+    solve_joints,
+)
 from service.compute.board.board import Board
 from service.compute.board.next_poses import draw_board_plan, suggest_board_poses
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
@@ -28,7 +35,7 @@ from service.core.arms.model import ArmModel, arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from service.jobs import records
-from service.worker.calibration.records import arm_correction_record, corrected_mounting, hand_eye_record
+from service.worker.records import arm_correction_record, corrected_mounting, hand_eye_record
 from simulators.scene.arm import ARM_ERRORS, ArmErrorKind, ArmErrors, perturbed_forward
 from simulators.scene.factory_calibrations import CALIBRATIONS, draw_departures
 from simulators.scene.world import Scene

@@ -8,9 +8,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.common import require_writable, require_writable_folder, write_whole
+from service.cli.common import (
+    protocol_file,
+    require_writable,
+    require_writable_folder,
+    shipped_protocols,
+    write_whole,
+)
 from service.cli.main import app
-from service.cli.shipped_protocols import protocol_file, shipped_protocols
 from service.core.errors import ConfigurationError, ProtocolError
 from service.store.records import SITE
 from service.store.store import Store

@@ -41,7 +41,7 @@ except SystemExit as end:
 AT_READY = """
 import json, sys
 from service.cli.main import main
-from service.cli.site import serve
+from service.cli import serve
 def ready(*_address, **_how):
     raise SystemExit
 serve._announce = ready
@@ -126,8 +126,8 @@ def test_a_kind_is_found_without_the_others() -> None:
         "import json, sys; from service.jobs import job_kinds; assert job_kinds()['match'].name == 'match'; "
         "assert job_kinds().get('match') is job_kinds()['match']; print(json.dumps(sorted(sys.modules)))"
     )
-    assert "service.jobs.poses.match" in modules
-    assert "service.jobs.surfaces.fuse" not in modules
+    assert "service.jobs.match" in modules
+    assert "service.jobs.fuse" not in modules
 
 
 def test_the_collector_rests_only_while_modules_are_loaded() -> None:

@@ -12,7 +12,7 @@ from tests.support.rig.rig import REPOSITORY
 # Every kind of step or job declares its records by these names, and they are read as `module.Name`.
 _OF_A_KIND = {"Arguments", "Answer", "Params", "Measures", "Result"}
 # Goes into data sets as it is; those who read them know it by this name.
-_GIVEN_AWAY = {"compute/matching/loader.py", "dataset/posed/h5_loader.py"}
+_GIVEN_AWAY = {"compute/matching/loader.py", "dataset/h5_loader.py"}
 
 
 def public_classes() -> dict[str, list[str]]:

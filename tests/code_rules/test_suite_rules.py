@@ -244,9 +244,7 @@ def test_tests_that_cost_more_than_asked_for_are_left_out(tmp_path: Path) -> Non
     ]
     costs = {"test_dear": 2.0, "TestAll::test_dear_too": 9.0, "test_cheap": 1.9}
     left_out: list[SimpleNamespace] = []
-    config: Any = SimpleNamespace(
-        hook=SimpleNamespace(pytest_deselected=lambda *, items: left_out.extend(items))
-    )
+    config: Any = SimpleNamespace(hook=SimpleNamespace(pytest_deselected=lambda *, items: left_out.extend(items)))
     limit = CostLimit(2.0, {"tests/code_rules/test_suite_rules.py": costs})
     limit.pytest_collection_modifyitems(config, items)  # pyright: ignore[reportArgumentType]
     assert [item.nodeid.rpartition("::")[2] for item in items] == ["test_cheap", "test_unknown"]

@@ -26,27 +26,25 @@ SERVICE = {
     "service/store/durable_effects.py": "the clock of the host, which all others are given",
     # how long something took, for a report; nothing is decided by it
     "service/audit/replay/replay.py": "measures how long a job took",
-    "service/audit/verify/process.py": "measures how long a verification took",
+    "service/audit/verify/verifications.py": "measures how long a verification took",
     "service/benchmark/programs/measured.py": "measures how long a program took",
-    "service/cli/evidence/audit.py": "measures how long a verification took, and says when it was",
-    "service/cli/run/demo.py": "measures how long the demonstration took",
+    "service/cli/audit.py": "measures how long a verification took, and says when it was",
+    "service/cli/demo.py": "measures how long the demonstration took",
     "service/compute/matching/scores.py": "measures how long a pair of images took",
     "service/compute/sfm/estimate.py": "measures how long a reconstruction took",
     "service/compute/sfm/front_end.py": "measures how long a reconstruction took",
-    "service/web/monitoring/request_counts.py": "measures how long a page took",
+    "service/web/monitoring.py": "measures how long a page took",
     # the date of a file that is written now
     "service/audit/report/content.py": "the time of a report that is given none",
     "service/benchmark/running.py": "the time at which a benchmark ended",
     # what waits for another process, on a pipe, a socket or a file, which knows no other clock
-    "service/audit/background/child_process.py": "in a child: its parent reads no more than so many lines a second",
+    "service/audit/background.py": "a child says no more than its parent reads; and rests, so that pages come first",
     "service/cli/common.py": "a person at a terminal is shown progress only where it takes long",
-    "service/cli/run/terminal/hands.py": "the time limit of a socket",
+    "service/cli/operators.py": "the time limit of a socket",
     "service/compute/sfm/colmap_process.py": "the time limit of a child process's answer",
     "service/store/database/engine.py": "SQLite waits for another process, by the host's clock",
     "service/store/signatures/log.py": "waits for another process that signs, by the host's clock",
     "service/worker/pool.py": "in a child: looks whether the worker lives",
-    # leaves the processor to others; no time is waited for
-    "service/audit/background/incremental.py": "rests, so that pages are answered first",
 }
 
 # The tests and their helpers that may: they are about processes, wires and machines outside the test's.

@@ -13,9 +13,8 @@ UNTYPED = re.compile(r"\b(dict|Mapping|MutableMapping)\[str, (Any|object)\]")
 # The modules in which JSON, rows of SQL or messages of a child process become records, or records become these.
 EDGES = {
     # recorded events and arguments of jobs, before their records are read and after they are written
-    "service/audit/overview/corrections.py": "a correction names any field of any recorded event",
     "service/audit/overview/findings.py": "a correction names any field of any recorded event",
-    "service/audit/record/event_rows.py": "shows recorded events even where they are altered and no longer records",
+    "service/audit/record/rows.py": "shows recorded events even where they are altered and no longer records",
     "service/audit/replay/recomputed.py": "arguments of a job with recomputed answers, before its kind reads them",
     "service/core/jobs.py": "hashes recorded arguments of any kind of job; references as they stand in them",
     "service/core/records/base.py": "writes a record into an event",
@@ -27,8 +26,8 @@ EDGES = {
     # rows of SQL, and their hashes
     "service/people/rows.py": "the row of a session, which is hashed",
     "service/store/events.py": "hashes and writes the rows of events",
-    "service/store/files/artefacts.py": "hashes the row of an artefact",
-    "service/store/queue/leases.py": "values of a row",
+    "service/store/artefacts.py": "hashes the row of an artefact",
+    "service/store/runs.py": "values of a row",
     "service/store/signatures/checkpoints.py": "payloads of rows, from which keys of every version are read",
     "service/store/store.py": "an answer as it is written into its event",
     "service/store/verification/chain_checks.py": "checks rows that may be altered and no longer records",
@@ -44,22 +43,22 @@ EDGES = {
     "service/core/protocol/models.py": "the JSON schema of a protocol",
     "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",
-    "service/dataset/package/crate.py": "writes ro-crate-metadata.json",
-    "service/dataset/package/croissant.py": "writes croissant.json",
-    "service/dataset/posed/of_run/statement.py": "writes dataset.json",
-    "service/dataset/formats/radiance/unit_box.py": "writes unit_box.json",
-    "service/worker/capture/held_images.py": "writes and reads the file of a hand-held image",
-    "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
+    "service/dataset/crate.py": "writes ro-crate-metadata.json",
+    "service/dataset/croissant.py": "writes croissant.json",
+    "service/dataset/about_run.py": "writes dataset.json",
+    "service/dataset/formats/radiance.py": "writes unit_box.json",
+    "service/worker/hand_answer.py": "writes and reads the file of a hand-held image",
+    "service/worker/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/sfm/colmap_process.py": "messages of a child process",
     "service/compute/sfm/child.py": "messages of a child process",
     # JSON that commands print
-    "service/cli/compute/evaluate_chamfer.py": "prints JSON",
-    "service/cli/compute/fuse.py": "prints JSON",
-    "service/cli/evidence/audit.py": "prints JSON",
-    "service/cli/evidence/replay.py": "prints JSON",
-    "service/cli/run/status.py": "prints JSON",
-    "service/cli/run/import_command.py": "prints JSON",
+    "service/cli/evaluate.py": "prints JSON",
+    "service/cli/fuse.py": "prints JSON",
+    "service/cli/audit.py": "prints JSON",
+    "service/cli/replay.py": "prints JSON",
+    "service/cli/status.py": "prints JSON",
+    "service/cli/import_command.py": "prints JSON",
 }
 
 

@@ -17,7 +17,7 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.interfaces import CtSource
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
+from service.audit.report.output import render_html
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import FilesKept
 from service.core.run.state import RunState

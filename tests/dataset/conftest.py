@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.pixels import undistorted_data_set
+from service.dataset.records import DataSet
 from tests.support.scenes.posed import posed_data_set
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import RecordedRun, read_run
-from service.audit.replay.scratch import ScratchStore
+from service.audit.replay.recomputed import ScratchStore
 from service.compute.matching.pairs import relative_covariance
 from service.core.run.state import JobState
-from service.dataset.posed.of_run.data_set import data_set_of
-from service.dataset.posed.of_run.view_covariances import pose_covariance
+from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import RunSummary
-from service.jobs.registration import register
+from service.dataset.view_covariances import pose_covariance
+from service.jobs import register
 from service.worker.job import JobAnswer
 from tests.support.recorded.recomputed import ARM, arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run

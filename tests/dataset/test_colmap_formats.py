@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 
 from service.core.errors import DataError
-from service.dataset.posed.records import DataSet
+from service.dataset.records import DataSet
 from tests.support.scenes.posed import scene
 from tests.support.scenes.read_formats import check_depth, corners, picture, truth_px, written
 

@@ -20,10 +20,10 @@ from service.compute.pixels.masks import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
-from service.dataset.posed.of_run.data_set import control_spheres, data_set_of, specimen_pixels
-from service.dataset.posed.of_run.posts import upwards
-from service.dataset.posed.of_run.view_covariances import pose_covariance
-from service.dataset.posed.records import Mesh
+from service.dataset.posts import upwards
+from service.dataset.records import Mesh
+from service.dataset.run_data_set import control_spheres, data_set_of, specimen_pixels
+from service.dataset.view_covariances import pose_covariance
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import tamper

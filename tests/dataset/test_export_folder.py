@@ -14,10 +14,10 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image_of
 from service.compute.pixels.masks import hull_mask
 from service.core.errors import ConfigurationError, DataError
-from service.dataset.posed.exporter import exporter, exporters, write_data_set
-from service.dataset.posed.folder import ExportFolder, export_folder
-from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
-from service.dataset.posed.records import DataSet, Pixels, PosedView
+from service.dataset.export_folder import ExportFolder, export_folder
+from service.dataset.exporter import exporter, exporters, write_data_set
+from service.dataset.pixels import cropped_data_set, undistorted_data_set
+from service.dataset.records import DataSet, Pixels, PosedView
 from tests.support.scenes.posed import posed_data_set, scene
 
 
@@ -185,7 +185,7 @@ def test_an_image_is_decoded_once_for_all_its_crops(
         decoded.append(path)
         return read_image_of(path, camera)
 
-    monkeypatch.setattr("service.dataset.posed.pixels.read_image_of", counted)
+    monkeypatch.setattr("service.dataset.pixels.read_image_of", counted)
     whole = undistorted_data_set(dataset) if straight else dataset
     everywhere = cropped_data_set(
         whole, lambda view: np.ones((view.camera.height, view.camera.width), bool), (40, 30), most=4

@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from service.core.geometry import Array, apply, inverse
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import DataSet, PosedView
 from tests.support.scenes.posed import posed_data_set, scene
 
 

@@ -11,18 +11,18 @@ import pytest
 
 from service.audit.record.run import RecordedRun, read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
+from service.audit.report.output import render_html
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array
 from service.core.run.state import RunState
-from service.dataset.posed.of_run.data_set import data_set_of
-from service.dataset.posed.of_run.view_covariances import pose_covariance
-from service.dataset.posed.records import DataSet
+from service.dataset.records import DataSet
 from service.dataset.registrations import own_registration, registrations, signed_rows
+from service.dataset.run_data_set import data_set_of
+from service.dataset.view_covariances import pose_covariance
 from service.run_record import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.known_spheres import displayed_registration, scan_spheres
+from service.web.record.outlines import displayed_registration, scan_spheres
 from service.web.scene.data import scene_of
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 

@@ -16,11 +16,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from service.core.records.data_set import DataSetStatement
-from service.dataset.posed.about import About, UsedDevice
-from service.dataset.posed.exporter import exporter, exporters, write_data_set
-from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet
-from service.jobs.registration.evaluate import Contribution, ErrorBudget, Row
+from service.dataset.exporter import exporter, exporters, write_data_set
+from service.dataset.pixels import undistorted_data_set
+from service.dataset.records import About, DataSet, UsedDevice
+from service.jobs.evaluate import Contribution, ErrorBudget, Row
 from tests.support.scenes.croissant import read_croissant
 from tests.support.scenes.posed import posed_data_set
 

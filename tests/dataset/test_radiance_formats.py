@@ -13,8 +13,8 @@ import pytest
 from service.compute.pixels.masks import WorldSphere
 from service.core.errors import DataError
 from service.core.geometry import Array, inverse
-from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.pixels import undistorted_data_set
+from service.dataset.records import DataSet
 from tests.support.scenes.posed import posed_data_set
 from tests.support.scenes.read_formats import corners, document, picture, truth_px, written
 

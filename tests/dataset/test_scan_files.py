@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run.scan_files import scan_files
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.run_data_set import scan_files
 from service.dataset.summary import summarise
 from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
 from tests.support.runs.bench_run import bench_store

@@ -27,7 +27,7 @@ from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform
-from service.worker.registration.evaluate import budget_record
+from service.worker.evaluate import budget_record
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
 from tests.support.stated_errors import sigma_components_m
 

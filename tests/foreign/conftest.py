@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.dataset.posed.records import DataSet
+from service.dataset.records import DataSet
 from tests.support.scenes.posed import posed_data_set
 
 

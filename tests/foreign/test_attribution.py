@@ -15,9 +15,8 @@ import pytest
 from service.core.errors import DataError
 from service.core.protocol.models import load_protocol
 from service.core.records.data_set import DataSetStatement, Party, doi_address, licence_address, party
-from service.dataset.posed.about import About
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import About, DataSet
 from service.steps import params_models
 from service.steps.protocol_check import implausible
 from tests.support.rig.rig import REPOSITORY

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.compute.import_ros import keep_image
+from service.cli.import_ros import keep_image
 from service.cli.main import app
 from service.compute.poses.camera_files import read_camera_json
 from service.compute.poses.pose_files import read_poses
 from service.compute.poses.ros_messages import StampedImage
+from service.dataset.exported import data_set_of_folder
 from service.dataset.formats.mcap import stamps_ns
-from service.dataset.posed.of_folder import data_set_of_folder
-from service.dataset.posed.records import DataSet
+from service.dataset.records import DataSet
 from tests.support.scenes.read_formats import written
 
 NAMED_BY_FILE = {

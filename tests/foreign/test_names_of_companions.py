@@ -13,7 +13,7 @@ from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.meshes.companions import companion_names, companions
 from drivers.meshes.mesh_file import read_mesh_file
 from service.core.records.events import FilesKept
-from service.dataset.posed.of_run.scan_files import scan_files
+from service.dataset.run_data_set import scan_files
 from service.dataset.summary import summarise
 from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
 from tests.support.runs.bench_run import bench_store

@@ -20,11 +20,10 @@ from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
-from service.dataset.posed.of_run.about_run import about_run
-from service.dataset.posed.records import SIMULATED
-from service.dataset.preview.surfaces import SimplifiedMesh, fused_mesh, shown_distances
-from service.dataset.recorded_fusion import recorded_fusion
-from service.dataset.summary import summarise
+from service.dataset.about_run import about_run
+from service.dataset.preview_surfaces import SimplifiedMesh, fused_mesh, shown_distances
+from service.dataset.records import SIMULATED
+from service.dataset.summary import recorded_fusion, summarise
 from service.steps import params_models
 from service.worker.job import JobContext
 from service.worker.loop import HANDLERS

@@ -8,11 +8,10 @@ import pytest
 from service.compute.planning.coverage import CoverageLimits
 from service.compute.planning.next_views import predicted_information
 from service.core.geometry import apply, inverse
-from service.jobs.capture import hand_view as job
+from service.jobs import hand_view as job
 from service.jobs.records import Camera, Limits
-from service.worker.capture.hand_guide import HandGuide
-from service.worker.capture.held_images import HandheldImage
-from service.worker.capture.scene import CaptureScene
+from service.worker.hand_answer import HandGuide, HandheldImage
+from service.worker.scene import CaptureScene
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, scene
 
 MADE = scene(6, width=1920, seed=2)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import read_run
-from service.dataset.posed.of_run.view_covariances import view_covariances
+from service.dataset.view_covariances import view_covariances
 from tests.support.rig.rig import orthocapture
 from tests.support.runs.run_by_hand import run_by_hand, small_protocol
 

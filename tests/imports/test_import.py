@@ -14,14 +14,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from service.cli.demo import true_error_mm
 from service.cli.main import app
-from service.cli.run.demo import true_error_mm
 from service.core.errors import DataError
 from service.core.protocol.models import load_protocol
 from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
 from service.core.records.import_list import FileRole, PhotographRole
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import summarise
 from service.import_folder import CtReading, find_places, import_rig, list_import
 from service.run_start import recorded_rig, recorded_run, start_run

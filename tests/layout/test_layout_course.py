@@ -12,7 +12,7 @@ from service.core.records.events import JobFinished, OperatorAction, StepMeasure
 from service.core.records.events import Uncertainty as Bounds
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.jobs.surfaces.layout import Answer, LayoutDetails
+from service.jobs.layout import Answer, LayoutDetails
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.worker import loop
 from service.worker.job import JobAnswer, RecordedContext

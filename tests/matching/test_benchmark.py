@@ -19,7 +19,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.matching.loader import MatchingData
 from service.compute.matching.methods.method import GROUP
 from service.core.geometry import Array
-from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set
 
 CAMERA = CameraModel(480, 360, 700.0, 702.0, 238.0, 181.0, -0.05, 0.01, 3e-4, -2e-4)

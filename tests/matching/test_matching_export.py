@@ -21,9 +21,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.matching.loader import VISIBLE, MatchingData
 from service.compute.matching.pairs import CLASSES, relative_covariance
 from service.core.geometry import Array, apply, inverse
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.pixels import undistorted_data_set
+from service.dataset.records import DataSet
 from tests.support.scenes.posed import posed_data_set, reach, scene
 
 CAMERA = CameraModel(320, 240, 380.0, 382.0, 156.0, 123.0, -0.12, 0.04, 8e-4, -5e-4)

@@ -11,8 +11,8 @@ import pytest
 
 from service.audit.record.run import read_run
 from service.core.jobs import jobs_of
-from service.dataset.posed.of_run.pose_errors import own_pose_errors
 from service.dataset.summary import RunSummary
+from service.dataset.view_covariances import own_pose_errors
 
 RECORDED = Path(__file__).parents[1] / "data" / "recorded" / "2026-11-23.tar.xz"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.cli.run.beside import worker_beside
+from service.cli.run import worker_beside
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.background.child_process import ChildProcesses, ChildState, report
+from service.audit.background import ChildProcesses, ChildState, report
 from service.core.errors import DataError
 from service.store.durable_effects import SystemClock
 

@@ -6,7 +6,7 @@ import gc
 
 import pytest
 
-from service.runner.memory import short_collections
+from service.runner.upkeep import short_collections
 from tests.support.runs.bench_run import Bench
 
 

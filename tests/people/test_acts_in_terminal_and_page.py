@@ -12,8 +12,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from service.cli.act import ACTS
 from service.cli.main import app
-from service.cli.run.act import ACTS
 from service.core.records.events import (
     DeviceTrouble,
     ItemTicked,

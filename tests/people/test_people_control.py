@@ -12,7 +12,7 @@ from service.core.records.events import ControlTaken
 from service.people.control import Control
 from service.people.person import AccountError, ControlError, NotAllowedError, Person
 from service.people.sessions import People
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import QUICK_HASHES, password_of, populate

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from service.audit.record.run import RecordedFiles
-from service.audit.replay.scratch import ScratchStore
+from service.audit.replay.recomputed import ScratchStore
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.records.events import ArtefactRef
 from service.worker.job import JobContext, RecordedContext

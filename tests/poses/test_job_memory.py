@@ -16,9 +16,8 @@ from service.core.records.events import JobFailed
 from service.jobs import job_kinds
 from service.jobs.kind import Demand
 from service.jobs.memory_grants import Grant, MemoryGrants, waiting_for_memory
-from service.store.errors import LeaseLostError
-from service.store.queue.leases import ProcessIdentity
-from service.store.records import NewJob
+from service.store.records import LeaseLostError, NewJob
+from service.store.runs import ProcessIdentity
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker import loop

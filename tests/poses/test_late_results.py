@@ -19,14 +19,13 @@ import cv2
 import numpy as np
 import pytest
 
-from service.audit.background.incremental import Progress
-from service.audit.bundle.export import export_bundle
-from service.audit.bundle.report import bundle_report
+from service.audit.background import PartialProgress
+from service.audit.bundle.export import bundle_report, export_bundle
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest, digests
 from service.audit.verify.bundle_verifier import main as verify_bundle
-from service.cli.run.terminal.operators import Display
-from service.cli.run.terminal.waiting import wait_for_results
+from service.cli.operators import Display
+from service.cli.run import wait_for_results
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (
@@ -41,8 +40,7 @@ from service.core.records.events import (
 )
 from service.core.run.fold import fold
 from service.core.run.state import LATER
-from service.dataset.late_results import late_results
-from service.dataset.registrations import shared_adjustment_note
+from service.dataset.registrations import late_results, shared_adjustment_note
 from service.rig import load_rig
 from service.run_record import RunRecord, read_log
 from service.run_start import start_run
@@ -125,7 +123,7 @@ class Run:
         computed = digests(self.store)
         digest = computed.get(self.run_id, wait_s=60.0)
         computed.close()
-        assert not isinstance(digest, Progress)
+        assert not isinstance(digest, PartialProgress)
         return digest
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from service.core.geometry import Array
 from service.core.jobs import Reference
+from service.jobs import detect_spheres
 from service.jobs.records import FurtherArm, Mounting, PosedPhotograph, matrix
-from service.jobs.registration import detect_spheres
 from service.steps.context import JobRequest
-from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.inputs import robot_camera_poses
 
 
 def shifted(x_m: float) -> Array:

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from service.cli.run.status import status_record
+from service.cli.status import status_record
 from service.core.gates.release import late_s, late_words
 from service.core.geometry import look_at
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
@@ -27,7 +27,7 @@ from service.steps.registration_sources import PLANNED, decisive
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.known_spheres import displayed_registration
+from service.web.record.outlines import displayed_registration
 from tests.support.record.store import enqueue
 from tests.support.recorded.registration_record import registration_record
 from tests.support.runs.computing_run import compute_jobs

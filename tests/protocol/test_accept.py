@@ -15,8 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.cli.run.terminal.hands import SimulatedHands
-from service.cli.run.terminal.operators import Display, TerminalOperator
+from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import ProtocolError
 from service.core.gates.acceptance import dependent_steps, depends_on

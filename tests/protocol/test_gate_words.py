@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import first_page
 from service.audit.overview.digest import digests
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
+from service.audit.report.output import render_html
 from service.cli.common import console
 from service.cli.main import app
 from service.core.gates.verdict import describe, describe_judged, figure, quantity, standing
 from service.core.records.events import GateVerdict, Uncertainty
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.run_data_set import data_set_of
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import WebSite, web_site
@@ -77,7 +77,7 @@ def test_the_first_page_counts_what_is_not_decided_apart(undecided: tuple[Path, 
         computed = digests(store)
         digest = computed.get(run_id, wait_s=60.0)
         computed.close()
-    assert not isinstance(digest, Progress)
+    assert not isinstance(digest, PartialProgress)
     counted = first_page.counts(digest)
     assert (counted["failed_gates"], counted["undecided_gates"]) == (1, 1)  # too few views before the redo
     (one,) = first_page.findings(digest, "undecided_gates")

@@ -18,7 +18,7 @@ from service.core.records.events import (
 )
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.jobs.calibration import board_view, calibrate
+from service.jobs import board_view, calibrate
 from service.jobs.records import Camera
 from service.monitor.snapshot import SignOfLife
 from tests.support.rig.bench_rig import answer

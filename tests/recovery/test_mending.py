@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from service.cli.run.terminal.hands import SimulatedHands
-from service.cli.run.terminal.operators import AutomaticOperator, Display
+from service.cli.operators import AutomaticOperator, Display, SimulatedHands
 from service.cli.terminal_output import Terminal
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import parse_protocol

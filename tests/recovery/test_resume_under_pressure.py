@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from service.cli.common import WAITS_FOR_A_PERSON
-from service.cli.run.ending import end_with_children
+from service.cli.run import end_with_children
 from service.core.records.events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
 from tests.recovery.test_resume import captured, recorded, short_protocol, wait_for, wait_for_captures
 from tests.support.processes.waiting import until

@@ -18,7 +18,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_record
 from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
 from service.core.geometry import Array, Transform, inverse
-from service.jobs.registration import register
+from service.jobs import register
 from service.store.store import Store
 from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS

@@ -43,7 +43,7 @@ def test_doctor_tells_what_a_device_reports(
 ) -> None:
     who = DeviceIdentity("camera", "model", "serial", "firmware", "driver", "1", "address")
     devices = _Devices({"camera": DeviceReport(who, **report)})
-    monkeypatch.setattr("service.cli.site.doctor.Station", lambda _rig: devices)
+    monkeypatch.setattr("service.cli.doctor.Station", lambda _rig: devices)
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: bare\ndevices:\n  camera: {driver: gphoto}\n")
     words_typed = ["doctor", "--rig", str(rig), "--data", str(tmp_path / "data")]
@@ -63,7 +63,7 @@ def test_doctor_tells_what_a_device_reports(
 def test_doctor_names_a_device_by_what_it_states(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: DeviceIdentity, shown: str
 ) -> None:
-    monkeypatch.setattr("service.cli.site.doctor.Station", lambda _rig: _Devices({"it": DeviceReport(who)}))
+    monkeypatch.setattr("service.cli.doctor.Station", lambda _rig: _Devices({"it": DeviceReport(who)}))
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: bare\ndevices:\n  it: {driver: gphoto}\n")
     words = ["doctor", "--rig", str(rig), "--data", str(tmp_path / "data")]

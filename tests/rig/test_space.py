@@ -21,7 +21,7 @@ from service.core.run.state import RunState
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
-from service.store.files.space_used import forecast_of
+from service.store.disk_space import forecast_of
 from service.store.records import NewJob
 from service.worker.loop import work
 from tests.support.pages.web import web_site

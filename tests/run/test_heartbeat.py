@@ -215,7 +215,7 @@ def test_a_run_that_has_just_been_started_says_so(tmp_path: Path, active: RunSta
 
 
 def test_a_runner_that_is_started_is_told_of_at_once(tmp_path: Path) -> None:
-    from service.web.launch import Launcher  # noqa: PLC0415 - web_site puts a launcher in its place that starts nothing
+    from service.web.site import Launcher  # noqa: PLC0415 - web_site puts a launcher in its place that starts nothing
 
     with web_site(tmp_path) as web:
         run_id = web.begin_run().run_id

@@ -12,10 +12,10 @@ from bench.torture.faults.place.disk import FaultyDisk
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import StepNote
 from service.runner.held_run import held_run
-from service.runner.sealing import Seal
+from service.runner.upkeep import Seal
 from service.steps import params_models
 from service.store.durable_effects import DurableFiles, Files
-from service.store.errors import LeaseHeldError
+from service.store.records import LeaseHeldError
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store

@@ -17,8 +17,7 @@ from typer.testing import CliRunner, Result
 from service.audit.bundle.export import export_bundle
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
-from service.audit.report.output.pdf import write_pdf
+from service.audit.report.output import render_html, write_pdf
 from service.audit.runs.search import RunSearch, find_runs
 from service.audit.verify import bundle_verifier
 from service.cli.main import app

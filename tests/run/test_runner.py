@@ -14,9 +14,8 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.run_start import recorded_rig, recorded_run
-from service.store.errors import LeaseHeldError, RecordDamagedError
 from service.store.journal.rebuild import rebuild
-from service.store.records import Checkpoint
+from service.store.records import Checkpoint, LeaseHeldError, RecordDamagedError
 from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -19,7 +19,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.launch import Launcher
+from service.web.site import Launcher
 from tests.support.processes.runners import no_runner_left
 from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol

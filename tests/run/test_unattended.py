@@ -11,8 +11,7 @@ from typer.testing import CliRunner, Result
 
 from service.cli.common import WAITS_FOR_A_PERSON
 from service.cli.main import app
-from service.cli.run.terminal.hands import SimulatedHands
-from service.cli.run.terminal.operators import AutomaticOperator, Display, TerminalOperator
+from service.cli.operators import AutomaticOperator, Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import PersonNeededError
 from service.core.records.events import OperatorAction, StepFailed

@@ -19,7 +19,7 @@ import pytest
 from service.core.records.events import SignInRecorded
 from service.store.records import SITE
 from service.store.store import Store
-from service.web.server.open_streams import OpenStream, OpenStreams
+from service.web.connections import OpenStream, OpenStreams
 from tests.support.pages.certificates import self_signed
 from tests.support.pages.serving import Server, serving
 from tests.support.processes.waiting import until

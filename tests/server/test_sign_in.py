@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.store.records import SITE
-from service.web.security.guards import cookie_name
+from service.web.security import cookie_name
 from tests.support.pages.web import PIN, WebSite, web_site
 from tests.support.record.stepped_clock import SteppedClock
 

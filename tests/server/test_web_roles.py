@@ -15,7 +15,7 @@ from starlette.routing import Route
 
 from service.people.person import ROLES, Permission, Role, may
 from service.store.records import SITE
-from service.web.security.guards import Guard
+from service.web.security import Guard
 from tests.support.pages.web import Browser, WebSite, web_site
 
 # What people who are not signed in may request. Everything else has a guard.

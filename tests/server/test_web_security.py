@@ -19,7 +19,7 @@ from schemathesis.core.result import Ok
 from schemathesis.schemas import APIOperation
 
 from service.people.person import ROLES, Role, may
-from service.web.security.shield import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
+from service.web.security import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
 from tests.support.pages.web import HOST, PIN, Browser, WebSite, web_site
 
 HOSTILE = (

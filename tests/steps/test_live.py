@@ -26,12 +26,12 @@ from service.compute.registration.hypotheses import paired
 from service.core.arms.model import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
-from service.jobs.capture import live_view
+from service.jobs import live_view
 from service.store.store import Store
-from service.worker.calibration.records import arm_correction_record
+from service.worker.inputs import robot_camera_poses
 from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS, work
-from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.records import arm_correction_record
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 from tests.support.runs.computing_run import compute_jobs
@@ -290,7 +290,7 @@ def measured_run(
         compute_jobs(bench.store)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
-    monkeypatch.setattr("service.worker.capture.live_view.find_outlines", exactly)
+    monkeypatch.setattr("service.worker.live_view.find_outlines", exactly)
     bench.operator.on_show = serve
     return bench
 

@@ -23,8 +23,7 @@ from service.store.backup.backup import BackupOptions, back_up
 from service.store.backup.restore import restore
 from service.store.database.engine import database_path, open_read_only
 from service.store.durable_effects import DurableFiles
-from service.store.errors import SigningKeyError
-from service.store.records import SITE
+from service.store.records import SITE, SigningKeyError
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

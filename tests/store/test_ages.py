@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from service.store.ages import Ages
+from service.store.durable_effects import Ages
 from tests.support.record.stepped_clock import SteppedClock
 
 

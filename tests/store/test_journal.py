@@ -20,15 +20,13 @@ from service.core.records.events import OperatorAction, RecordRebuilt
 from service.store.database.engine import DATABASE_NAME, database_path
 from service.store.database.tables import metadata
 from service.store.durable_effects import DurableFiles, SystemClock
-from service.store.errors import RecordDamagedError
 from service.store.journal import changes
-from service.store.journal.copies import JournalCopy, journal_copy
 from service.store.journal.journal import read_tail
 from service.store.journal.lines import NAME, Ending, JournalLine, read_lines
 from service.store.journal.rebuild import RebuildReport, rebuild
-from service.store.records import SITE, NewJob
+from service.store.records import SITE, NewJob, RecordDamagedError
 from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.second_place import SecondPlace
+from service.store.signatures.second_place import JournalCopy, SecondPlace, journal_copy
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

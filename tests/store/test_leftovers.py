@@ -16,7 +16,7 @@ from sqlalchemy import update
 
 from service.core.records.events import ArtefactRef, LeftoversRemoved, SessionStarted
 from service.store.database.tables import leases
-from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
+from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -157,7 +157,7 @@ def test_what_a_runner_may_still_record_stays_though_the_clock_was_set_forward(
         store.record(run, [started], actor="runner")
         with store.lease(run, "a runner", 30.0):
             ref = put_image(store, "v1")
-            monkeypatch.setattr("service.store.files.leftovers.psutil", later)
+            monkeypatch.setattr("service.store.disk_space.psutil", later)
             must_stay(store)
             must_record(store, run, ref)
 

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from service.core.records.events import DeviceTrouble, JobFinished, Payload, StepNote, ViewpointFailed
-from service.store.logged_events import tell
+from service.store.store import tell
 from tests.support.record.core import Log
 
 
 def said(caplog: pytest.LogCaptureFixture, payload: Payload) -> dict[str, Any]:
     """The fields of the one line about an event."""
     event = Log().event(payload, "worker 1")
-    with caplog.at_level(logging.INFO, logger="service.store.logged_events"):
+    with caplog.at_level(logging.INFO, logger="service.store.store"):
         tell([event])
     (line,) = caplog.records
     assert line.getMessage() == payload.kind
@@ -46,6 +46,6 @@ def test_a_note_is_told(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_a_log_that_nobody_keeps_costs_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, logger="service.store.logged_events"):
+    with caplog.at_level(logging.WARNING, logger="service.store.store"):
         tell([Log().event(StepNote(step="views", attempt=1, note="a", data={}))])
     assert caplog.records == []

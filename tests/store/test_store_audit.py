@@ -13,14 +13,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.evidence.audit import audit_app
+from service.cli.audit import audit_app
 from service.core.errors import OrthocaptureError, StoreError
 from service.core.records.events import StepNote
 from service.store.database.engine import database_path
 from service.store.durable_effects import utc_text
-from service.store.errors import UnknownRunError
 from service.store.events import event_sha256
-from service.store.records import SITE, NewArtefact, NewJob
+from service.store.records import SITE, NewArtefact, NewJob, UnknownRunError
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import show, verify

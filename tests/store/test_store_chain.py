@@ -29,9 +29,8 @@ from service.store.database import engine as database
 from service.store.database import new_schema
 from service.store.database.engine import database_path
 from service.store.database.tables import metadata
-from service.store.errors import StoreVersionError, UnknownRunError
 from service.store.events import ROOT, canonical, canonical_parsed, event_sha256, parse_canonical
-from service.store.records import NewArtefact
+from service.store.records import NewArtefact, StoreVersionError, UnknownRunError
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

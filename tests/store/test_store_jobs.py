@@ -16,9 +16,8 @@ import pytest
 from service.core.errors import DataError, StoreError
 from service.core.records.events import JobFailed, JobFinished, StepNote
 from service.store.durable_effects import SystemClock
-from service.store.errors import LeaseHeldError, LeaseLostError
-from service.store.queue.leases import ProcessIdentity, RunLease
-from service.store.records import NewArtefact, NewJob
+from service.store.records import LeaseHeldError, LeaseLostError, NewArtefact, NewJob
+from service.store.runs import ProcessIdentity, RunLease
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until

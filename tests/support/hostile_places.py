@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from service.cli.common import print_document, print_json, print_table, reporting_errors
 from service.cli.main import app
-from service.cli.run.terminal.operators import Display
+from service.cli.operators import Display
 from service.cli.terminal_output import Terminal, bar_of_counts, bar_of_shares, listed, styled
 from service.core.errors import ConfigurationError
 from service.core.records.events import DeviceTrouble, OperatorAction, StepNote

@@ -21,8 +21,8 @@ import trimesh
 import yaml
 
 from service.audit.record.run import read_run
-from service.audit.replay.copied import CopiedResults
-from service.cli.run.demo import free_address
+from service.audit.replay.recomputed import CopiedResults
+from service.cli.demo import free_address
 from service.core.jobs import jobs_of, references_in
 from tests.support.processes.package import Package, installed_package
 from tests.support.processes.waiting import until

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.folder import check_folder
-from service.dataset.posed.records import DataSet
+from service.dataset.export_folder import check_folder
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import DataSet
 from tests.support.scenes.posed import posed_data_set
 
 pytestmark = [pytest.mark.sweep, pytest.mark.timeout(300)]
@@ -23,7 +23,7 @@ ROUNDS = 7  # the last two die at the last operations
 CHILD = """
 import os, signal, sys
 from pathlib import Path
-from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set
 
 photographs, out, name, death = Path(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4])

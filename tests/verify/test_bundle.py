@@ -14,13 +14,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import export_bundle
-from service.audit.bundle.report import bundle_report
+from service.audit.bundle.export import bundle_report, export_bundle
 from service.audit.verify import bundle_verifier
-from service.cli.evidence.audit import audit_app
+from service.cli.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
 from service.core.records.events import EvidenceExported, RunReleased, StepNote
-from service.store.files.artefacts import hash_file
+from service.store.artefacts import hash_file
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -15,8 +15,7 @@ from service.core.records.events import DeviceTrouble, SignInRecorded
 from service.store.durable_effects import DurableFiles
 from service.store.records import SITE
 from service.store.signatures.log import NAME
-from service.store.signatures.log_copy import LogCopy
-from service.store.signatures.second_place import Away, SecondPlace, away_words
+from service.store.signatures.second_place import Away, LogCopy, SecondPlace, away_words
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -25,9 +25,8 @@ from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
 from service.store.events import canonical
 from service.store.records import SITE, Checkpoint
-from service.store.signatures.log import NAME, LogEnd, SignatureLog, read_log
-from service.store.signatures.log_copy import LogCopy
-from service.store.signatures.seen import SeenSignatures
+from service.store.signatures.log import NAME, LogEnd, SeenSignatures, SignatureLog, read_log
+from service.store.signatures.second_place import LogCopy
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -14,14 +14,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.evidence.audit import audit_app
+from service.cli.audit import audit_app
 from service.core.errors import IntegrityError
 from service.core.records.events import SignInRecorded
-from service.store.errors import SigningKeyError, UnknownRunError
-from service.store.records import SITE
+from service.store.records import SITE, SigningKeyError, UnknownRunError
 from service.store.signatures import signing
-from service.store.signatures.checkpoints import signed_by, statement
-from service.store.signatures.keys import KeyFolder
+from service.store.signatures.checkpoints import KeyFolder, signed_by, statement
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -19,7 +19,7 @@ import rfc8785
 
 from service.audit.bundle.export import export_bundle
 from service.audit.verify import bundle_verifier
-from service.store.files.artefacts import hash_file
+from service.store.artefacts import hash_file
 from service.store.signatures.signing import public_keys, rotate_key
 from service.store.store import Store
 from tests.support.record.bundled_site import Site, check, record, run_verifier

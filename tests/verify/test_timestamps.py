@@ -16,7 +16,7 @@ from service.audit.verify import bundle_verifier
 from service.core.records.events import DeviceTrouble
 from service.rig import load_rig
 from service.run_start import time_stamp_authority as time_stamp_authority_of
-from service.store.errors import TimestampError
+from service.store.records import TimestampError
 from service.store.signatures.signing import checkpoint
 from service.store.signatures.timestamps import Authority, stamp_end, timestamp
 from service.store.store import Store

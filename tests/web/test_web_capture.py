@@ -17,7 +17,7 @@ from service.core.geometry import apply, inverse, look_at
 from service.core.records.events import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, scene_json, viewing_frame
 from service.steps.context import StationLayout
-from service.web.calibration.board_advice import empty_regions
+from service.web.calibration.boards import empty_regions
 from service.web.capture.plan_drawing import WIDTH, plan_drawing
 from service.web.capture.view import StepViewpoint
 from service.web.page.charts import LEVELS, dots, heat_map, vector_field

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import (
@@ -27,6 +28,7 @@ from service.core.records.events import (
     StepRetried,
     ViewpointFailed,
 )
+from service.core.recovery import planned_views
 from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.core.run.expected import duration, tries_words
 from service.core.run.fold import fold
@@ -34,10 +36,9 @@ from service.core.text.words import time_here
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
 from service.web.page.robot_banner import robot_banner
-from service.web.page.run_words import limit, measure_name, planned_views
-from service.web.run.figures import view_intervals_s
+from service.web.page.run_frame import limit
 from service.web.run.view import run_view
-from service.web.run.view_records import RunView, Viewer
+from service.web.run.view_records import RunView, Viewer, view_intervals_s
 from tests.support.record.core import Log
 
 PROTOCOLS = Path(__file__).parents[2] / "protocols"

@@ -10,7 +10,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from service.audit.overview.corrections import correct
+from service.audit.overview.findings import correct
 from service.audit.record.starts import record_start
 from service.core.errors import DataError
 from service.core.records.events import EvidenceExported, OperatorAction, RunAborted, RunReleased
@@ -20,11 +20,10 @@ from service.people.sessions import People
 from service.rig import load_rig
 from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles, SystemClock
-from service.store.journal.copies import journal_copy
 from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.log import NAME
-from service.store.signatures.second_place import SecondPlace
+from service.store.signatures.second_place import SecondPlace, journal_copy
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store

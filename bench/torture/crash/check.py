@@ -20,8 +20,8 @@ from service.core.records.events import Event, JobFinished, RecordedView, StepMe
 from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.database.engine import database_path
-from service.store.errors import StoreVersionError
-from service.store.files.leftovers import leftovers, remove_leftovers
+from service.store.disk_space import leftovers, remove_leftovers
+from service.store.records import StoreVersionError
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.store import Store
 from service.store.verification.verify import verify

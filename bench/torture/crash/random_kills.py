@@ -32,7 +32,7 @@ from service.core.run.fold import fold
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
 from service.steps import params_models
-from service.store.files.leftovers import leftovers, remove_leftovers
+from service.store.disk_space import leftovers, remove_leftovers
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct

@@ -224,7 +224,7 @@ def _begin(store: Store, place: Place, _parent: int, person: str) -> None:
 
 
 def _run(store: Store, place: Place, _parent: int, person: str) -> None:
-    """Run, as service.cli.run.commands.drive does."""
+    """Run, as `drive` of service.cli.run does."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     rig = CrashRig(folder=place.files, motions=place.motions)

@@ -1,9 +1,14 @@
-"""What goes into a bundle: a run's records and files, read in one transaction and written one by one."""
+"""What goes into a bundle: a run's records and files, read in one transaction, streamed into a zip file, hashed."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import hashlib
+import os
+import stat
+import zipfile
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -11,24 +16,162 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, select
 
-from service.audit.bundle.readme import readme
-from service.audit.bundle.zip_file import BundleZip, ManifestEntry
-from service.audit.record.missing_results import not_in_yet
-from service.core.errors import IntegrityError
+from service.audit.record.run import not_in_yet
+from service.core.errors import DataError, IntegrityError, StoreError
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, RunStarted
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.people.rows import full_names
+from service.store.artefacts import chunks_of, read_artefacts
 from service.store.database.tables import artefacts as artefact_table
 from service.store.database.tables import events as event_table
 from service.store.database.tables import jobs as job_table
+from service.store.durable_effects import DurableFiles
 from service.store.events import canonical, event_text, parse_canonical, read_events
-from service.store.files.artefacts import chunks_of, read_artefacts
 from service.store.records import SITE, Artefact
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 from service.store.signatures.signing import PublicKey
 from service.store.store import Store
+
+ZipTime = tuple[int, int, int, int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class ManifestEntry:
+    """A file of the bundle, as the manifest lists it."""
+
+    path: str
+    sha256: str
+    size_bytes: int
+
+
+class BundleZip:
+    """A zip file that is being written; every entry is hashed on the way."""
+
+    def __init__(self, archive: zipfile.ZipFile, at: ZipTime) -> None:
+        self._archive = archive
+        self._at = at
+        self.listed: list[ManifestEntry] = []
+
+    def add(self, path: str, chunks: Iterable[bytes], *, compress: bool = True) -> ManifestEntry:
+        """Write one file. Images are stored without compression."""
+        info = zipfile.ZipInfo(path, date_time=self._at)
+        info.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+        info.create_system = 3  # Unix on every machine, so that the permissions below count
+        info.external_attr = (stat.S_IFREG | 0o644) << 16
+        digest, size = hashlib.sha256(), 0
+        with self._archive.open(info, "w", force_zip64=True) as entry:
+            for chunk in chunks:
+                digest.update(chunk)
+                size += len(chunk)
+                entry.write(chunk)
+        listed = ManifestEntry(path, digest.hexdigest(), size)
+        self.listed.append(listed)
+        return listed
+
+
+@contextmanager
+def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | None = None) -> Generator[BundleZip]:
+    """A zip file that gets its name only when it is complete and durable; otherwise nothing is left of it.
+
+    Args:
+        target: the file.
+        at: time stamp of its entries.
+        leaving: called with the complete file before it gets its name; if it raises, no file appears.
+
+    Raises:
+        DataError: a file of this name exists.
+        StoreError: the disk refused.
+    """
+    if target.exists():
+        raise DataError("the file exists already", where=str(target), remedy="Name a new one; nothing is overwritten")
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with part.open("xb") as handle:
+            with zipfile.ZipFile(handle, "w", allowZip64=True) as archive:
+                yield BundleZip(archive, at)
+            handle.flush()
+            os.fsync(handle.fileno())
+        if leaving is not None:
+            leaving(part)
+        os.link(part, target)  # unlike a rename, it never replaces a file that another process has made meanwhile
+        DurableFiles().sync_directory(target.parent)
+    except FileExistsError as error:
+        raise DataError("the file exists already", where=str(target), remedy="Name a new one") from error
+    except OSError as error:
+        raise StoreError(
+            f"the bundle cannot be written: {error.strerror or error}",
+            where=str(error.filename or target),
+            remedy="Check free space and permissions; the evidence is unchanged",
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+_TEXT = """Evidence of run {run_id}, exported by orthocapture
+
+{warnings}To verify this bundle, on any machine with Python 3.9 or newer and the package `cryptography`, offline:
+
+    python -I verify.py BUNDLE.zip --key FINGERPRINT
+
+With -I, Python takes no module from beside verify.py in place of its own.
+FINGERPRINT is the fingerprint of the site's signing key. Ask the site for it; do not take it from this bundle. The
+site sees it with `orthocapture audit keys`. This bundle states that it is
+{key_id}
+A verifier that comes with what it verifies could be forged as well. Take verify.py from an installation or a release
+of orthocapture that you trust (service/audit/verify/bundle_verifier.py, the same file byte for byte).
+
+events.jsonl        everything that happened in the run: who, what, when (UTC and monotonic), one record per line.
+                    sha256 is SHA-256 over the RFC 8785 canonical JSON of the other fields; previous_sha256 links
+                    the records to a chain.
+site_events.jsonl   the chain of the site: accounts and their roles, sign-ins, signing keys, starts of the service. It
+                    is complete, because only an unbroken chain shows that no key was slipped in.
+checkpoints.jsonl   Ed25519 signatures; each covers every event and every artefact row up to its own event.
+timestamps.jsonl    time stamps (RFC 3161) that authorities gave for checkpoints, if any.
+keys.jsonl          the public keys, oldest first; each signed its successor as its last act.
+artefacts.jsonl     where each recorded file came from; the files are artefacts/ab/ab… named by their SHA-256.
+jobs.jsonl          the computations and their arguments.
+protocol.yaml, rig.yaml     as they were when the run began.
+report.html         a report for people, made from these records up to the last event in this bundle. Open it in a
+                    browser; it needs no network.
+ro-crate-metadata.json      a description of this bundle for machines (RO-Crate 1.1).
+manifest.json, manifest.sig every file with its hash, and the signature over that list.
+
+What this proves: nothing was changed after the site's key signed it. What it cannot prove: that the people and
+devices told the truth, or that nobody but the site had the key.
+"""
+
+
+def readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -> str:
+    """The text of README.txt.
+
+    Args:
+        run_id: of the run.
+        key_id: fingerprint of the site's signing key.
+        root: the run's first event.
+        missing: results that have not arrived yet, in words.
+    """
+    return _TEXT.format(run_id=run_id, key_id=key_id, warnings=_warnings(root, missing))
+
+
+def _warnings(root: RunStarted, missing: Sequence[str]) -> str:
+    """Paragraphs on a simulated rig, imported images and missing results; each ends with an empty line."""
+    found: list[str] = []
+    if root.simulated:
+        found.append("SIMULATED: no real device took part in this run. It is not a record of a real acquisition.")
+    if root.origin == "imported":
+        found.append(
+            "IMPORTED: how the images were captured is not in evidence, only when and by whom they were imported."
+        )
+    if missing:
+        lines = "".join(f"\n  - {line}" for line in missing)
+        found.append(
+            "NOT IN YET: when this bundle was made, these results had not arrived. A later export has those that "
+            f"came.{lines}"
+        )
+    return "".join(f"{text}\n\n" for text in found)
+
 
 Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
 _EVENT = ("actor", "at_utc", "monotonic_s", "previous_sha256", "run_id", "seq", "sha256")

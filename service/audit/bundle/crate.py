@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from service.audit.bundle.contents import BundledRun
-from service.audit.bundle.zip_file import ManifestEntry
+from service.audit.bundle.contents import BundledRun, ManifestEntry
 from service.core.gates.acceptance import describe_accepted
 from service.core.recorded_devices import bodies, recorded_report
 from service.core.records.events import (
@@ -21,15 +20,7 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.core.records.import_list import imported_sentence
-from service.dataset.package.crate_entities import (
-    CONTEXT,
-    anchor,
-    descriptor,
-    device,
-    file_entity,
-    person,
-    software,
-)
+from service.dataset.crate import CONTEXT, anchor, descriptor, device, file_entity, person, software
 from service.store.events import canonical, references
 from service.store.records import Artefact
 

@@ -8,21 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 
-from service.audit.bundle.contents import BundledRun, Progress, read_bundled_run, write_artefacts, write_records
+from service.audit.bundle.contents import (
+    BundledRun,
+    BundleZip,
+    Progress,
+    ZipTime,
+    read_bundled_run,
+    write_artefacts,
+    write_records,
+    writing_bundle,
+)
 from service.audit.bundle.crate import crate_json
-from service.audit.bundle.zip_file import BundleZip, ZipTime, writing_bundle
 from service.core.errors import IntegrityError
 from service.core.gates.release import refuse_export
 from service.core.protocol.models import Protocol
 from service.core.records.events import EvidenceExported, RunStarted
 from service.core.run.fold import fold
-from service.dataset.package.crate_entities import METADATA
+from service.dataset.crate import METADATA
 from service.run_start import recorded_run
+from service.store.artefacts import hash_file
+from service.store.disk_space import require_export_space
 from service.store.events import canonical
-from service.store.files.artefacts import hash_file
-from service.store.files.space_used import require_export_space
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint, public_keys, sign
 from service.store.store import Store
@@ -198,3 +207,23 @@ def _zip_time(at_utc: str) -> ZipTime:
     year, month, day = (int(part) for part in at_utc[:10].split("-"))
     hour, minute, second = (int(part) for part in at_utc[11:19].split(":"))
     return max(year, 1980), month, day, hour, minute, second - second % 2
+
+
+def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[AuditReport, int], bytes]:
+    """Returns a function that makes the HTML report of a run up to an event from the result of its verification.
+
+    The report is dated by the last event in the bundle, so that the same evidence gives the same bytes.
+    """
+
+    def make(audit: AuditReport, last_seq: int) -> bytes:
+        # Imported here because numerics, pictures and the 3D scene take long to load, and only the report needs them.
+        from service.audit.record.run import read_run  # noqa: PLC0415
+        from service.audit.report.content import report_content  # noqa: PLC0415
+        from service.audit.report.output import render_html  # noqa: PLC0415
+
+        run = read_run(data, run_id, last_seq=last_seq)
+        made_at = datetime.fromisoformat(run.events[-1].at_utc)
+        report = report_content(run, audit, made_at=made_at, with_scene=with_pictures, with_pictures=with_pictures)
+        return render_html(report).encode()
+
+    return make

@@ -1,16 +1,20 @@
-"""Exports requested in the browser: each is made by a process of its own and kept in DIR/exports."""
+"""Exports requested in the browser, the formats that can be chosen, and downloads as zip files."""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import os
 import re
 import stat
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from threading import Lock
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from service.audit.background.child_process import ChildProcesses, ChildState
+from service.audit.background import ChildProcesses, ChildState, Progress, report
 from service.audit.bundle.export import marked_name
 from service.audit.export.wanted import (
     ExportRequest,
@@ -21,10 +25,95 @@ from service.audit.export.wanted import (
     keep_request,
     unfinished_exports,
 )
-from service.core.errors import DataError, IllegalTransitionError
+from service.core.errors import DataError, IllegalTransitionError, IntegrityError
 from service.core.records.events import Event, EvidenceExported
-from service.dataset.posed.folder import SUMS
+from service.dataset.export_folder import SUMS
 from service.store.durable_effects import Clock, utc_text
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+
+_OLDEST = (1980, 1, 1, 0, 0, 0)  # the earliest time in zip; the files state their own dates
+_CHUNK = 1 << 20
+_TEXT = frozenset({".json", ".txt", ".csv", ".md", ".xml", ".ply", ".py"})  # others are compressed already
+
+
+class _Sent(io.RawIOBase):
+    """A write-only file for zipfile; `take` removes and returns the bytes written since the last call."""
+
+    def __init__(self) -> None:
+        self._kept = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        view = memoryview(data).cast("B")
+        self._kept += view
+        return len(view)
+
+    def take(self) -> bytes:
+        taken = bytes(self._kept)
+        self._kept.clear()
+        return taken
+
+
+def zip_chunks(folder: Path, sums_sha256: str) -> Iterator[bytes]:
+    """The bytes of the zip file: the files that SHA256SUMS lists, and SHA256SUMS last.
+
+    Args:
+        folder: an exported data set.
+        sums_sha256: recorded hash of its list of checksums.
+
+    Raises:
+        IntegrityError: the list is not the recorded one, or a file is not the listed one: the transfer breaks off.
+    """
+    sums = (folder / SUMS).read_bytes()
+    if hashlib.sha256(sums).hexdigest() != sums_sha256:
+        raise _altered(SUMS)
+    sent = _Sent()
+    with zipfile.ZipFile(sent, "w", allowZip64=True) as archive:
+        for line in sums.decode().splitlines():
+            sha256, _, name = line.partition("  ")
+            yield from _entry(archive, sent, folder, name, sha256)
+        with archive.open(_info(f"{folder.name}/{SUMS}"), "w") as entry:
+            entry.write(sums)
+    yield sent.take()
+
+
+def _entry(archive: zipfile.ZipFile, sent: _Sent, folder: Path, name: str, sha256: str) -> Iterator[bytes]:
+    """One file, read without following links."""
+    inside = PurePosixPath(name)
+    if inside.is_absolute() or ".." in inside.parts:
+        raise _altered(name)
+    digest = hashlib.sha256()
+    try:
+        opened = os.open(folder / inside, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError as error:
+        raise _altered(name) from error
+    with (
+        os.fdopen(opened, "rb") as file,
+        archive.open(_info(f"{folder.name}/{name}"), "w", force_zip64=True) as entry,
+    ):
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+            entry.write(chunk)
+            yield sent.take()
+    if digest.hexdigest() != sha256:
+        raise _altered(name)
+
+
+def _info(name: str) -> zipfile.ZipInfo:
+    info = zipfile.ZipInfo(name, date_time=_OLDEST)
+    info.compress_type = zipfile.ZIP_DEFLATED if PurePosixPath(name).suffix in _TEXT else zipfile.ZIP_STORED
+    info.external_attr = 0o100644 << 16
+    return info
+
+
+def _altered(name: str) -> IntegrityError:
+    return IntegrityError("a file of the export is not as it was written", where=name, remedy="Export again")
+
 
 FOLDER = "exports"
 FORMAT = "format"  # instead of a What: the data set in a format
@@ -168,3 +257,50 @@ class Exports:
                 keep_request(target, request)
             words = [str(self._data), run_id, export, str(target), by]
             self._children.start(run_id, words, by=by, tidy=lambda: forget_request(target))
+
+
+# The registered formats, listed by a process of its own: they load the numerics, which a web process does without.
+#
+# `python -m service.audit.export.exports`
+
+
+_KEY = ""  # the list belongs to no run
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format: its name, and what it is in words."""
+
+    name: str
+    words: str
+
+
+class Formats:
+    """The formats that this installation has."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._children = ChildProcesses("service.audit.export.exports", "list of formats", clock)
+
+    def state(self) -> ChildState | None:
+        """The progress or the outcome of the listing; None before it was begun."""
+        return self._children.state(_KEY)
+
+    def known(self, wait_s: float = 0.0) -> tuple[Format, ...]:
+        """The formats in the order of their names; empty while they are not known. Begins to list them once."""
+        if self.state() is None:
+            self._children.start(_KEY, (), by="")
+        if wait_s:
+            self._children.wait(_KEY, wait_s)
+        now = self.state()
+        return tuple(Format(**row) for row in (now.result or () if now else ()))
+
+
+def listed(_progress: Progress) -> list[dict[str, str]]:
+    """The formats as plain data. Raises ConfigurationError."""
+    from service.dataset.exporter import exporters  # noqa: PLC0415 - see above
+
+    return [{"name": name, "words": how.words} for name, how in sorted(exporters().items())]
+
+
+if __name__ == "__main__":
+    report(listed, outlives_parent=False)

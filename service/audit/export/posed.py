@@ -6,20 +6,19 @@ import re
 from functools import partial
 from pathlib import Path
 
-from service.audit.background.child_process import Progress
+from service.audit.background import Progress
 from service.audit.bundle.export import record_export, require_exportable
 from service.audit.export.wanted import WantedExport
-from service.audit.record.missing_results import not_in_yet
-from service.audit.record.run import read_run
+from service.audit.record.run import not_in_yet, read_run
 from service.core.errors import ConfigurationError
 from service.core.gates.release import refuse_data_set
 from service.core.records.data_set import VERSION
-from service.dataset.posed.exporter import Exporter, exporter, write_data_set
-from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
-from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
-from service.dataset.posed.records import DataSet
+from service.dataset.exporter import Exporter, exporter, write_data_set
+from service.dataset.pixels import cropped_data_set, undistorted_data_set
+from service.dataset.records import DataSet
+from service.dataset.run_data_set import data_set_of, specimen_pixels
 from service.dataset.summary import RunSummary
-from service.store.files.space_used import require_export_space
+from service.store.disk_space import require_export_space
 from service.store.store import Store
 
 _SIZE = re.compile(r"([1-9]\d{0,5})x([1-9]\d{0,5})")

@@ -11,15 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.audit.background.child_process import Progress, ends_tidily_when_stopped, report
-from service.audit.bundle.export import export_bundle, marked_name, record_export, require_exportable
-from service.audit.bundle.report import bundle_report
-from service.audit.bundle.zip_file import writing_bundle
+from service.audit.background import Progress, ends_tidily_when_stopped, report
+from service.audit.bundle.contents import writing_bundle
+from service.audit.bundle.export import bundle_report, export_bundle, marked_name, record_export, require_exportable
 from service.audit.export.exports import FORMAT
 from service.audit.export.wanted import forget_request, kept_request
 from service.core.errors import ConfigurationError
-from service.store.files.artefacts import chunks_of
-from service.store.files.space_used import require_export_space
+from service.store.artefacts import chunks_of
+from service.store.disk_space import require_export_space
 from service.store.store import Store
 
 if TYPE_CHECKING:
@@ -84,9 +83,9 @@ def _in_format(store: Store, run_id: str, target: Path, actor: str, progress: Pr
 
 
 def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
-    from service.audit.record.missing_results import not_in_yet  # noqa: PLC0415
-    from service.dataset.posed.exporter import exporter, write_data_set  # noqa: PLC0415
-    from service.dataset.posed.of_run.data_set import data_set_of  # noqa: PLC0415
+    from service.audit.record.run import not_in_yet  # noqa: PLC0415
+    from service.dataset.exporter import exporter, write_data_set  # noqa: PLC0415
+    from service.dataset.run_data_set import data_set_of  # noqa: PLC0415
 
     missing = not_in_yet(run.protocol, run.state, run.events)
     write_data_set(data_set_of(run.summary(), missing), exporter("plain"), folder)
@@ -98,8 +97,7 @@ def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable
 
 def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool) -> None:
     from service.audit.report.content import report_content  # noqa: PLC0415
-    from service.audit.report.output.html import write_html  # noqa: PLC0415
-    from service.audit.report.output.pdf import write_pdf  # noqa: PLC0415
+    from service.audit.report.output import write_html, write_pdf  # noqa: PLC0415
 
     (write_pdf if pdf else write_html)(report_content(run, audit, with_scene=not pdf), path)
 

@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from service.core.errors import DataError
 from service.core.records.data_set import FIRST_VERSION, VERSION, DataSetStatement
-from service.dataset.posed.folder import being_written, discard, interrupted
+from service.dataset.export_folder import being_written, discard, interrupted
 
 _USUAL_CROP = "1920x1080"  # as in the paper
 _WANTED = ".wanted"  # ends the name of the file beside an unfinished export

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview.digest import Digest, FailedGate
-from service.audit.record.run_rows import RunBasics
+from service.audit.record.rows import RunBasics
 from service.audit.verify.verifications import Verification
 from service.core.gates.verdict import describe_judged
 from service.core.run.state import DeviationKind
@@ -205,9 +205,9 @@ def matches(run: ListedRun, wanted: RunFilter) -> bool:
     )
 
 
-def known(value: Digest | Progress) -> Digest | None:
+def known(value: Digest | PartialProgress) -> Digest | None:
     """The digest, or None while it is being computed."""
-    return None if isinstance(value, Progress) else value
+    return None if isinstance(value, PartialProgress) else value
 
 
 def people_of(runs: Sequence[ListedRun]) -> list[str]:

@@ -8,8 +8,7 @@ from sqlalchemy import Connection, text
 
 from service.audit.overview.digest import Digest
 from service.audit.overview.findings import LISTED
-from service.audit.record.event_rows import EventRow, computed_sha256, read_rows, seq_of_hash
-from service.audit.record.run_rows import plain
+from service.audit.record.rows import EventRow, computed_sha256, plain, read_rows, seq_of_hash
 from service.core.errors import StoreError
 from service.core.records.events import OperatorAction, RunReleased
 

@@ -1,25 +1,28 @@
-"""A run read from the evidence, read-only."""
+"""Reads a run from the evidence, read-only, with the results that had not arrived."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from service.core.errors import IntegrityError
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import Event, RunStarted
 from service.core.run.fold import fold
 from service.core.run.state import RunState
-from service.dataset.summary import RunSummary
 from service.people.rows import full_names, named
 from service.steps import params_models
+from service.store.artefacts import ArtefactFiles, read_artefacts
 from service.store.database.engine import open_read_only
 from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
-from service.store.files.artefacts import ArtefactFiles, read_artefacts
 from service.store.records import Artefact
-from service.store.run_rows import read_runs, resolve_run
+from service.store.runs import read_runs, resolve_run
+
+if TYPE_CHECKING:
+    from service.dataset.summary import RunSummary
 
 
 class RecordedFiles:
@@ -49,6 +52,8 @@ class RecordedRun:
 
     def summary(self) -> RunSummary:
         """The run as the functions of the report and of the data set take it."""
+        from service.dataset.summary import RunSummary  # noqa: PLC0415 - loads the numerics, which a bundle does without
+
         return RunSummary(self.run_id, self.protocol, self.root, self.state, self.events, self.files)
 
     def named(self, account: str) -> str:
@@ -84,3 +89,16 @@ def read_run(data_dir: Path, name: str, *, last_seq: int | None = None) -> Recor
     loaded = parse_protocol(content, params_models(), name=root.protocol.original_name)
     state = fold(loaded.protocol, events)
     return RecordedRun(data_dir, run_id, root, loaded.protocol, events, state, artefacts, files, names)
+
+
+def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:
+    """Lines such as `COLMAP from scratch: was still being computed`; empty if every result has arrived.
+
+    The same events give the same lines, so the time that is left is not among them.
+    """
+    from service.steps.due_jobs import missing_results  # noqa: PLC0415 - as in service.run_record
+
+    return [
+        f"{left.what}: {f'there will be none, {left.failed}' if left.failed else 'was still being computed'}"
+        for left in missing_results(protocol, state, {}, events[-1].at_utc, 1)
+    ]

@@ -18,9 +18,8 @@ from service.runner.software import software_versions
 from service.store.database.tables import checkpoints, event_index, events, heads
 from service.store.durable_effects import Clock
 from service.store.events import to_event
-from service.store.queue.leases import ProcessIdentity
 from service.store.records import SITE
-from service.store.run_rows import read_open_runs
+from service.store.runs import ProcessIdentity, read_open_runs
 from service.store.store import Store
 
 

@@ -1,23 +1,80 @@
-"""The answers that a replay has computed, as input of later jobs, and how far the final registrations drift."""
+"""Keeps the answers that a replay has computed as input of later jobs, in its own folder, and tells their drift."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from service.audit.replay.copied import CopiedResults
+from service.audit.record.run import RecordedFiles
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
-from service.core.jobs import computed_by, jobs_of, resolve
-from service.core.records.events import JobFinished
+from service.core.jobs import Reference, computed_by, jobs_of, resolve
+from service.core.records.events import ArtefactRef, JobFinished
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary
-from service.jobs.registration import register
+from service.jobs import register
+from service.store.artefacts import hash_file
 from service.worker.job import JobAnswer
+
+_TELLING_DIGITS = 12  # a number with so many digits is recognised by its value, since nobody typed it
+_TELLING_BITS = (
+    32  # what rounding leaves of zero (-7 / 2**55) prints many digits, but two computations often meet in it
+)
+
+
+@dataclass
+class CopiedResults:
+    """Parts of the answers so far, by their content: an argument that equals a part was copied from there."""
+
+    _parts: dict[str, Reference] = field(default_factory=dict[str, Reference])
+
+    def add(self, job: JobState) -> None:
+        """Add the answer of a finished job."""
+        self._index(job.job, "result", job.result)
+
+    def _index(self, job: str, path: str, value: Any) -> None:
+        if _is_telling(value):
+            self._parts[_key(value)] = Reference(job, path)
+        if isinstance(value, Mapping):
+            for name, item in cast("Mapping[str, Any]", value).items():
+                self._index(job, f"{path}/{name}", item)
+        elif isinstance(value, list | tuple):
+            for index, item in enumerate(cast("Sequence[Any]", value)):
+                self._index(job, f"{path}/{index}", item)
+
+    def as_references(self, arguments: Any) -> Any:
+        """The arguments with a reference in place of every copy."""
+        if _is_telling(arguments):
+            found = self._parts.get(_key(arguments))
+            if found is not None:
+                return found.record()
+        if isinstance(arguments, Mapping):
+            return {name: self.as_references(item) for name, item in cast("Mapping[str, Any]", arguments).items()}
+        if isinstance(arguments, list | tuple):
+            return [self.as_references(item) for item in cast("Sequence[Any]", arguments)]
+        return arguments
+
+
+def _key(value: Any) -> str:
+    return json.dumps(value, sort_keys=True)
+
+
+def _is_telling(value: Any) -> bool:
+    """Whether this holds a number with so many digits that equality means a copy."""
+    if isinstance(value, float):
+        digits = repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")
+        return len(digits) >= _TELLING_DIGITS and value.as_integer_ratio()[0].bit_length() >= _TELLING_BITS
+    if isinstance(value, Mapping):
+        return any(map(_is_telling, cast("Mapping[str, Any]", value).values()))
+    return isinstance(value, list | tuple) and any(map(_is_telling, cast("Sequence[Any]", value)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,3 +156,34 @@ def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
             places = [apply(np.array(each.T_world_scan), centre_m) for each in (before, after)]
             in_world = mm(float(np.linalg.norm(places[1] - places[0])))
         yield Drift(before.poses, in_world, mm(true_error_m(moved, given, centre_m)))
+
+
+class ScratchStore:
+    """The store that a job's handler sees during a replay."""
+
+    def __init__(self, recorded: RecordedFiles, folder: Path) -> None:
+        self._recorded = recorded
+        self._folder = folder
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """A recomputed file, or else the recorded one. Raises IntegrityError."""
+        own = self._folder / sha256
+        return own if own.is_file() else self._recorded.artefact_path(sha256, verify=verify)
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Keep bytes in the scratch folder."""
+        digest = hashlib.sha256(data).hexdigest()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / digest).write_bytes(data)
+        return ArtefactRef(
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=len(data), original_name=original_name
+        )
+
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Keep a copy of a file in the scratch folder."""
+        digest, size = hash_file(path)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, self._folder / digest)
+        return ArtefactRef(
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=original_name
+        )

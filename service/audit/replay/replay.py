@@ -5,28 +5,19 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from service.audit.record.run import RecordedFiles, RecordedRun
-from service.audit.replay.differences import Comparison, compare_data, compare_files
-from service.audit.replay.recomputed import RecomputedJobs, drifts
-from service.audit.replay.results import (
-    ArtefactReplay,
-    GateReplay,
-    JobReplay,
-    ReplayReport,
-    Verdict,
-    VersionChange,
-)
-from service.audit.replay.scratch import ScratchStore
+from service.audit.replay.differences import Comparison, Difference, compare_data, compare_files
+from service.audit.replay.recomputed import Drift, RecomputedJobs, ScratchStore, drifts
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs import jobs_of, resolve
-from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, SessionStarted
+from service.core.records.events import ArtefactRef, GateVerdict, JobEnqueued, JobFinished, SessionStarted
 from service.core.run.state import JobState
 from service.jobs import job_kinds
 from service.runner.software import software_versions
@@ -34,6 +25,97 @@ from service.store.events import parse_canonical, payload_text
 from service.store.verification.verify import AuditReport, verify
 from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS
+
+Verdict = Literal["identical", "within_tolerance", "different", "not_replayed"]
+_WORST_FIRST: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
+
+
+@dataclass(frozen=True, slots=True)
+class VersionChange:
+    """A distribution that is not what it was when the run was recorded; "" where it is or was not installed."""
+
+    name: str
+    recorded: str
+    now: str
+
+
+@dataclass(frozen=True, slots=True)
+class ArtefactReplay:
+    """A file that a job wrote, and the same file written again."""
+
+    name: str
+    kind: str
+    recorded_sha256: str
+    recomputed_sha256: str
+    content: Comparison  # empty where the hashes are the same
+
+
+@dataclass(frozen=True, slots=True)
+class JobReplay:
+    """One job computed again."""
+
+    job: str
+    kind: str
+    step: str
+    attempt: int
+    label: str  # the source of poses, which distinguishes registrations; "" for other kinds
+    verdict: Verdict
+    measures: Comparison = field(default_factory=Comparison)
+    result: Comparison = field(default_factory=Comparison)
+    artefacts: tuple[ArtefactReplay, ...] = ()
+    duration_s: float = 0.0
+    error: str = ""  # why it could not be replayed
+    computed_by: str = ""  # the version that computed it, in words, if this program's gives other numbers
+
+    @property
+    def differences(self) -> tuple[Difference, ...]:
+        """Of measures, result and files, in this order, each worst first."""
+        parts = (self.measures, self.result, *(artefact.content for artefact in self.artefacts))
+        return tuple(difference for part in parts for difference in part.differences)
+
+
+@dataclass(frozen=True, slots=True)
+class GateReplay:
+    """A step's gates judged again by the measures that the replay gave."""
+
+    step: str
+    attempt: int
+    recorded: tuple[GateVerdict, ...]
+    recomputed: tuple[GateVerdict, ...]
+
+    @property
+    def changed(self) -> tuple[tuple[GateVerdict, GateVerdict], ...]:
+        """Verdicts that are now different: recorded, recomputed."""
+        pairs = zip(self.recorded, self.recomputed, strict=True)
+        return tuple((old, new) for old, new in pairs if old.passed != new.passed)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayReport:
+    """The whole replay. `gates_judged`: number of recorded verdicts that follow from the recorded measures."""
+
+    run_id: str
+    head_sha256: str
+    end_to_end: bool
+    versions: tuple[VersionChange, ...]
+    files_verified: int
+    bytes_verified: int
+    gates_judged: int
+    gates: tuple[GateReplay, ...]
+    jobs: tuple[JobReplay, ...]
+    drifts: tuple[Drift, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all jobs; a gate with another verdict is a difference."""
+        found: set[Verdict] = {job.verdict for job in self.jobs}
+        if any(gate.changed for gate in self.gates):
+            found.add("different")
+        for verdict in _WORST_FIRST:
+            if verdict in found:
+                return verdict
+        return "identical"
+
 
 Progress = Callable[[str, int, int], None]
 

@@ -18,9 +18,9 @@ from service.core.records.events import Event, GateVerdict, RunStarted
 from service.core.run.state import RunState, StepState
 from service.core.units import mm
 from service.dataset.registrations import evaluated
-from service.jobs.calibration import calibrate
+from service.jobs import calibrate
+from service.jobs.evaluate import Row
 from service.jobs.records import Camera
-from service.jobs.registration.evaluate import Row
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name

@@ -13,7 +13,7 @@ from sqlalchemy import Connection, text
 from service.core.records.entered import RunAbout
 from service.core.records.events import GatesEvaluated
 from service.store.records import SITE
-from service.store.run_rows import read_open_runs
+from service.store.runs import read_open_runs
 from service.store.store import Store
 
 Result = Literal["open", "completed", "aborted", "within", "outside", "released"]

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+import time
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from service.audit.background.child_process import ChildProcesses, ChildState
+from service.audit.background import ChildProcesses, ChildState, Progress, report
 from service.core.records.events import Record
 from service.store.durable_effects import Clock, utc_text
-from service.store.verification.verify import AuditReport
+from service.store.verification.verify import AuditReport, verify
 
 LISTED = 500  # most faults listed in a result
 
@@ -89,7 +91,7 @@ class Verifications:
     def __init__(self, data: Path, clock: Clock) -> None:
         self._data = data
         self._clock = clock
-        self._children = ChildProcesses("service.audit.verify.process", "verification", clock)
+        self._children = ChildProcesses("service.audit.verify.verifications", "verification", clock)
 
     def last(self, run_id: str) -> Verification | None:
         """The last result; None if there is none that can be read."""
@@ -114,3 +116,36 @@ class Verifications:
     def _keep(self, run_id: str, ended: ChildState) -> None:
         fields = {"at_utc": utc_text(self._clock.utc_now()), "by": ended.by, **ended.result}
         keep_verification(self._data, run_id, Verification.model_validate_json(json.dumps(fields)))
+
+
+# Verifies a run in a process of its own, so that pages stay fast: `python -m service.audit.verify.verifications`.
+#
+# It only reads the data folder, and ends when the process that started it ends.
+
+
+def verification(data: Path, run_id: str, progress: Progress) -> Outcome:
+    """Verify a run. Raises StoreError."""
+    begun_s = time.monotonic()
+    progress("reading the events", 0, 0)
+    found = verify(data, run_id, progress)
+    faults = [VerifiedFault(run_id=f.run_id, seq=f.seq, file=f.file, what=f.what) for f in found.faults[:LISTED]]
+    return Outcome(
+        ok=found.ok,
+        events=found.events,
+        artefacts=found.artefacts,
+        files=found.files,
+        bytes_hashed=found.bytes_hashed,
+        head_sha256=found.heads.get(run_id, ""),
+        faults=tuple(faults),
+        fault_count=len(found.faults),
+        notes=tuple(found.notes[:LISTED]),
+        duration_s=time.monotonic() - begun_s,
+    )
+
+
+def _told(progress: Progress) -> object:
+    return verification(Path(sys.argv[1]), sys.argv[2], progress).model_dump(mode="json")
+
+
+if __name__ == "__main__":
+    report(_told, outlives_parent=False)

@@ -11,10 +11,10 @@ from scipy.spatial.distance import cdist
 from service.compute.pixels.views import DEPTH_UNIT_MM, coded_depth
 from service.core.geometry import Array, inverse
 from service.core.units import mm
+from service.dataset.export_folder import ExportFolder, Part, json_bytes
+from service.dataset.exporter import Exporter
 from service.dataset.formats.meshes import mask_png, ply, png
-from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder, Part, json_bytes
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.records import DataSet, PosedView
 
 _SCENE = "test/000001"
 _OBJECT = 1

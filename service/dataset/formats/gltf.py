@@ -8,9 +8,9 @@ import struct
 from typing import Any
 
 from service.compute.poses.pose_files import OPENGL
-from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.export_folder import ExportFolder
+from service.dataset.exporter import Exporter
+from service.dataset.records import DataSet, PosedView
 
 _FLOAT, _UNSIGNED = 5126, 5125  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views

@@ -8,9 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.export_folder import ExportFolder, Part
+from service.dataset.exporter import Exporter
+from service.dataset.records import DataSet, PosedView
 
 LOADER = "loader.py"
 
@@ -30,7 +30,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
             f"views/{view.name}.h5", lambda path, view=view: _view(path, dataset, view), Part("arrays", view.name)
         )
     folder.written_by("data.h5", lambda part: _index(part, dataset))
-    source = importlib.resources.files("service.dataset.posed").joinpath("h5_loader.py")
+    source = importlib.resources.files("service.dataset").joinpath("h5_loader.py")
     folder.file(LOADER, source.read_bytes)
 
 

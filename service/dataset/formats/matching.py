@@ -25,9 +25,9 @@ from service.compute.matching.pairs import (
     points_seen,
 )
 from service.core.units import mm, mrad
-from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.export_folder import ExportFolder, Part
+from service.dataset.exporter import Exporter
+from service.dataset.records import DataSet, PosedView
 
 _POINTS = 20_000  # of the surface, by which overlap is measured: to within half a per cent
 _SEED = 14

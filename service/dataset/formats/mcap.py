@@ -25,10 +25,10 @@ from service.compute.poses.ros_messages import (
 )
 from service.core.errors import ConfigurationError
 from service.core.units import nanoseconds, nanoseconds_of_us
+from service.dataset.export_folder import ExportFolder
+from service.dataset.exporter import Exporter
 from service.dataset.formats.meshes import ground_truth_ply
-from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.records import DataSet, PosedView
 
 FILE = "data_set.mcap"
 WORLD, SCAN, CAMERA = "world", "scan", "camera"

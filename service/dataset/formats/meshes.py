@@ -10,7 +10,7 @@ from service.compute.ground_truth.surface import ply_bytes
 from service.compute.pixels.metadata import described
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.dataset.posed.records import Mesh
+from service.dataset.records import Mesh
 
 
 def ply(vertices: Array, faces: NDArray[np.int64], comment: str) -> bytes:

@@ -17,8 +17,8 @@ from service.core.protocol.step_params import (
 )
 from service.core.records.events import Record
 from service.core.units import metres
-from service.jobs.calibration import calibrate
-from service.jobs.calibration.records import HandEye, KnownBoard
+from service.jobs import calibrate
+from service.jobs.calibration_records import HandEye, KnownBoard
 from service.jobs.records import Camera, Matrix, matrix
 from service.steps.board_poses import BoardPoses
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome

@@ -21,8 +21,7 @@ from service.core.protocol.step_params import (
 )
 from service.core.records.events import Record
 from service.core.units import metres
-from service.jobs.registration import evaluate, register
-from service.jobs.surfaces import locate_spheres
+from service.jobs import evaluate, locate_spheres, register
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, earlier_answer, earlier_result
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures, Share

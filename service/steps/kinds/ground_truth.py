@@ -16,10 +16,9 @@ from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAME
 from service.core.records.events import Record
 from service.core.run.state import JobState
 from service.core.units import metres
+from service.jobs import fuse, locate_spheres, register
 from service.jobs.kind import read_part
 from service.jobs.records import Mounting, Point, PosedPhotograph, has_poses
-from service.jobs.registration import register
-from service.jobs.surfaces import fuse, locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import EarlierAnswer, artefact_of, earlier_answer
 from service.steps.measures import Count, Deg, ErrorMm, Measure, MeasureRecord, Share

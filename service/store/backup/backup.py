@@ -20,15 +20,14 @@ from sqlalchemy import Connection, select
 from service.core.errors import IntegrityError, StoreError
 from service.core.units import gigabytes
 from service.store.access import KEYS, PEPPER
+from service.store.artefacts import chunks_of, hash_file, relative_path
 from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.tables import artefacts, event_index, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
-from service.store.files.artefacts import chunks_of, hash_file, relative_path
 from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.journal.lines import first_lines
-from service.store.signatures.checkpoints import read_every_checkpoint
-from service.store.signatures.keys import KeyFolder
+from service.store.signatures.checkpoints import KeyFolder, read_every_checkpoint
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
 from service.store.verification import verify as audit

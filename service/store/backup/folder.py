@@ -24,8 +24,8 @@ from pydantic import ValidationError
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import Record
 from service.store.access import close_to_others
+from service.store.artefacts import TEMPORARY, ArtefactFiles
 from service.store.durable_effects import Files, IdSource
-from service.store.files.artefacts import TEMPORARY, ArtefactFiles
 
 MARKER = "orthocapture-backup.json"
 STATES = "states"

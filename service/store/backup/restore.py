@@ -12,11 +12,11 @@ from sqlalchemy import delete, select
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.records.events import DataRestored
 from service.store.access import KEYS
+from service.store.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
 from service.store.backup.folder import BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, open_read_only
 from service.store.database.tables import artefacts, control, leases, sessions
 from service.store.durable_effects import DurableFiles, Files, RandomIds
-from service.store.files.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
 from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.store import Store

@@ -23,10 +23,10 @@ from service.core.errors import StoreError
 from service.store.access import file_mode, open_new, require_access
 from service.store.database import new_schema
 from service.store.durable_effects import Files
-from service.store.errors import RecordDamagedError, StoreVersionError
 from service.store.journal import changes
 from service.store.journal.journal import REBUILD, Journal, Tail
 from service.store.journal.lines import RowImage
+from service.store.records import RecordDamagedError, StoreVersionError
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged

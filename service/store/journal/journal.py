@@ -19,7 +19,6 @@ from itertools import chain, pairwise
 from pathlib import Path
 
 from service.store.durable_effects import Files
-from service.store.errors import RecordDamagedError
 from service.store.journal.lines import (
     FIRST,
     NAME,
@@ -34,6 +33,7 @@ from service.store.journal.lines import (
     parse_mark,
     unreadable,
 )
+from service.store.records import RecordDamagedError
 
 REBUILD = (
     "Stop every orthocapture process of this data folder and run `orthocapture store rebuild`: it restores what was "

@@ -15,15 +15,14 @@ from urllib.parse import quote
 from service.core.errors import StoreError
 from service.core.records.events import RecordRebuilt
 from service.store.access import KEYS
+from service.store.artefacts import relative_path
 from service.store.backup.folder import folder_errors
 from service.store.database.engine import DATABASE_NAME, database_path, open_database, open_read_only
 from service.store.durable_effects import Clock, DurableFiles, Files, SystemClock, utc_text
-from service.store.files.artefacts import relative_path
 from service.store.journal import changes
-from service.store.journal.findings import journal_findings
+from service.store.journal.findings import Survey, committed_rows, journal_findings, survey
 from service.store.journal.journal import Journal
 from service.store.journal.lines import NAME, first_lines
-from service.store.journal.survey import Survey, committed_rows, survey
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -11,21 +11,21 @@ from sqlalchemy import Connection, select
 from service.core.records.events import KeyChanged, Payload, RunSigned, SignaturesWrittenAgain
 from service.store.database.tables import event_index, events, runs
 from service.store.durable_effects import utc_text
-from service.store.errors import SigningKeyError, UnknownRunError
 from service.store.events import read_head, to_event
-from service.store.records import SITE, Checkpoint
+from service.store.records import SITE, Checkpoint, SigningKeyError, UnknownRunError
 from service.store.signatures.checkpoints import (
+    KeyFolder,
     artefacts_digest,
     insert_checkpoint,
     key_fingerprint,
     last_checkpoint,
+    public_bytes,
     read_checkpoints,
     read_key_changes,
     signed_by,
     statement,
 )
-from service.store.signatures.keys import KeyFolder, public_bytes
-from service.store.signatures.seen import SeenSignatures
+from service.store.signatures.log import SeenSignatures
 from service.store.store import Store
 from service.store.verification.soundness import require_sound
 

@@ -28,9 +28,8 @@ from sqlalchemy import insert, select
 from service.core.records.events import DeviceTrouble, TimeStampKept
 from service.store.database.tables import timestamps
 from service.store.durable_effects import utc_text
-from service.store.errors import TimestampError
 from service.store.events import sha256_text
-from service.store.records import SITE, Checkpoint, Timestamp
+from service.store.records import SITE, Checkpoint, Timestamp, TimestampError
 from service.store.signatures.checkpoints import statement
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

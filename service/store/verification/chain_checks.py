@@ -11,8 +11,8 @@ from pydantic_core import ValidationError
 
 from service.core.errors import StoreError
 from service.core.records.events import PAYLOAD, ArtefactRef, SignaturesWrittenAgain
+from service.store.artefacts import record_sha256
 from service.store.events import ROOT, canonical_parsed, event_sha256_of_text, parse_canonical, references
-from service.store.files.artefacts import record_sha256
 from service.store.records import SITE
 from service.store.verification.pose_checks import PoseFacts, ReportedPose
 

@@ -19,8 +19,7 @@ from service.store.database.tables import (
     runs,
     sessions,
 )
-from service.store.errors import UnknownRunError
-from service.store.records import SITE, Checkpoint, Timestamp
+from service.store.records import SITE, Checkpoint, Timestamp, UnknownRunError
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 
 _Rows = dict[str, list[dict[str, Any]]]  # by run

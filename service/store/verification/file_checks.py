@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from service.core.errors import StoreError
-from service.store.files.artefacts import TEMPORARY, hash_file, relative_path
+from service.store.artefacts import TEMPORARY, hash_file, relative_path
 from service.store.verification.chain_checks import Fault, FileState
 
 Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)

@@ -10,18 +10,17 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from service.core.errors import StoreError
+from service.store.artefacts import read_artefacts
 from service.store.database.engine import DATABASE_NAME, RESTORE, Database, database_path, open_read_only
 from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
-from service.store.errors import UnknownRunError
 from service.store.events import read_events
-from service.store.files.artefacts import read_artefacts
 from service.store.journal.findings import journal_findings
-from service.store.records import SITE, Artefact, RunRow
-from service.store.run_rows import read_runs
+from service.store.records import SITE, Artefact, RunRow, UnknownRunError
+from service.store.runs import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import LogLine, log_findings, read_log, written_again_findings
-from service.store.signatures.log_copy import copy_faults
+from service.store.signatures.second_place import copy_faults
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import signature_checks as signatures

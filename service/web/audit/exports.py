@@ -10,9 +10,7 @@ from fastapi import APIRouter, Depends, Form, Path, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
 from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
-from service.audit.export.exports import Exports, What
-from service.audit.export.folder_zip import zip_chunks
-from service.audit.export.formats import Formats
+from service.audit.export.exports import Exports, Formats, What, zip_chunks
 from service.audit.export.wanted import WantedExport
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates.release import refuse_data_set, refuse_export, refuse_release, release_meaning
@@ -23,12 +21,11 @@ from service.people.tries import on_screen_of
 from service.run_acts import release_run, require_releasable
 from service.web.audit.frame import AuditFrame, CurrentAudit, audit_frame
 from service.web.page.rendering import render
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite
+from service.web.security import SignedInPerson, requires
+from service.web.site import CurrentSite, RunId
 
 router = APIRouter(tags=["exports"])
 
-RunId = Annotated[str, Path(max_length=64)]
 _READ = [Depends(requires("read"))]
 _REPORT = [Depends(requires("report"))]
 _EXPORT = [Depends(requires("export"))]

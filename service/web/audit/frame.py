@@ -1,4 +1,4 @@
-"""Shared by the audit's pages: the background computations of a data folder, and the frame of a run's pages."""
+"""Shared by the audit's pages: background computations of a data folder, the frame of a run's pages, query fields."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import Depends, FastAPI, Request
+from pydantic import AfterValidator, BaseModel, BeforeValidator
 
-from service.audit.background.child_process import ChildState
-from service.audit.background.incremental import IncrementalResults
+from service.audit.background import ChildState, IncrementalResults
 from service.audit.overview.digest import Digest, digests
-from service.audit.overview.first_page import verified
-from service.audit.provenance.graph import Graph, graphs
-from service.audit.record import run_rows
-from service.audit.record.run_rows import RunBasics
+from service.audit.overview.first_page import RunFilter, verified
+from service.audit.provenance import Graph, graphs
+from service.audit.record import rows
+from service.audit.record.rows import RunBasics
+from service.audit.record.search import ArtefactFilter, EventFilter
 from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 from service.web.site import CurrentSite, Site
 
 _LOCK = Lock()
@@ -85,7 +86,7 @@ class AuditFrame:
 def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
     """The frame of one run's page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
-        found = run_rows.runs(connection, run_id)
+        found = rows.runs(connection, run_id)
     if not found:
         raise UnknownRunError(f"there is no run {run_id!r}", remedy="Choose one from the list of runs")
     base = f"/audit/runs/{run_id}"
@@ -106,3 +107,65 @@ def link(address: str, query: Mapping[str, str | int | None]) -> str:
     """An address with its query; empty fields are left out."""
     fields = {name: value for name, value in query.items() if value not in ("", None, 0)}
     return f"{address}?{urlencode(fields)}" if fields else address
+
+
+LONGEST = 200  # characters of a filter; more is cut
+
+
+def cut(text: str) -> str:
+    """The text of a filter, without outer blanks and cut to the longest length."""
+    return text[:LONGEST].replace("\0", "")
+
+
+Text = Annotated[str, AfterValidator(cut)]
+Ticked = Annotated[bool, BeforeValidator(bool)]  # any text ticks the box
+
+
+class RunQuery(BaseModel):
+    """Filters of the list of runs."""
+
+    since: Text = ""
+    until: Text = ""
+    protocol: Text = ""
+    person: Text = ""
+    status: Text = ""
+    simulated: Text = ""
+    deviations: Ticked = False
+    unverified: Ticked = False
+    q: Text = ""
+    page: int = 1
+
+    def wanted(self) -> RunFilter:
+        """The filter of runs that these fields describe."""
+        return RunFilter(**self.model_dump(exclude={"page"}))
+
+
+class EventQuery(BaseModel):
+    """Filters of a list of events, which begins after one event or ends before one."""
+
+    step: Text = ""
+    device: Text = ""
+    person: Text = ""
+    kind: Text = ""
+    q: Text = ""
+    after: int = 0
+    before: int = 0
+
+    def wanted(self) -> EventFilter:
+        """The filter of events that these fields describe."""
+        return EventFilter(self.step, self.device, self.person, self.kind, self.q)
+
+
+class ArtefactQuery(BaseModel):
+    """Filters of the list of files."""
+
+    kind: Text = ""
+    step: Text = ""
+    device: Text = ""
+    viewpoint: Text = ""
+    q: Text = ""
+    page: int = 1
+
+    def wanted(self) -> ArtefactFilter:
+        """The filter of files that these fields describe."""
+        return ArtefactFilter(self.kind, self.step, self.device, self.viewpoint, self.q)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
 from service.core.errors import IllegalTransitionError
@@ -28,20 +28,16 @@ from service.web.calibration.view import (
 )
 from service.web.page.charts import DotPlot
 from service.web.page.rendering import render
-from service.web.page.run_frame import RunFrame, run_frame
-from service.web.page.run_words import gate_word, limit
-from service.web.record.images import further_cameras_of
-from service.web.record.recorded_rig import recorded_rig_section
-from service.web.security.guards import requires
-from service.web.site import CurrentSite, Site
+from service.web.page.run_frame import RunFrame, gate_word, limit, run_frame
+from service.web.record.images import further_cameras_of, recorded_rig_section
+from service.web.security import requires
+from service.web.site import CurrentSite, RunId, Site
 
 if TYPE_CHECKING:
     from service.dataset.further_cameras import KnownFurtherCamera
-    from service.web.calibration.board_advice import PoseAdvice
+    from service.web.calibration.boards import PoseAdvice
 
 router = APIRouter(tags=["calibration"])
-
-RunId = Annotated[str, Path(max_length=64)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +110,7 @@ def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
 def board_plan(site: CurrentSite, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
     """The board images of a calibration step as they are planned: corners over the image, and the camera's places."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
-    from service.web.calibration.board_plan_view import board_plan_of  # noqa: PLC0415
+    from service.web.calibration.boards import board_plan_of  # noqa: PLC0415
 
     headers = {"Cache-Control": "private, no-cache"}
     return Response(board_plan_of(site.run(run_id), step, site.data), media_type="image/svg+xml", headers=headers)
@@ -171,7 +167,7 @@ def _advice(
 ) -> tuple[list[tuple[str, int, int]], tuple[PoseAdvice, ...]]:
     """Parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
-    from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
+    from service.web.calibration.boards import advised_poses, empty_regions  # noqa: PLC0415
 
     coverage = None if found.intrinsics is None else found.intrinsics.coverage
     regions = [] if coverage is None else empty_regions(coverage.corners)

@@ -12,14 +12,13 @@ from service.core.protocol.models import Step
 from service.core.recorded_devices import RecordedIdentity, recorded_report
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
 from service.core.run.state import StepState
-from service.jobs.calibration import calibrate
-from service.jobs.calibration.records import ArmAnswer, HandEye, Intrinsics, Residuals
+from service.jobs import calibrate
+from service.jobs.calibration_records import ArmAnswer, HandEye, Intrinsics, Residuals
 from service.jobs.records import Camera
 from service.run_record import RunRecord
 from service.steps.kinds.calibration import Params
 from service.web.page.charts import DotPlot, HeatMap, VectorField, dots, heat_map, vector_field
-from service.web.record.board_images import BoardUse, board_use
-from service.web.record.images import StatedCamera, captures_of, stated_camera
+from service.web.record.images import BoardUse, StatedCamera, board_use, captures_of, stated_camera
 
 
 @dataclass(frozen=True, slots=True)

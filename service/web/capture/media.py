@@ -24,12 +24,11 @@ from service.core.records.events import ArtefactRef
 from service.monitor.snapshot import ask_for_frames, frame_path
 from service.notes import NOTE_PHOTOGRAPH
 from service.run_record import RunRecord
+from service.store.artefacts import to_artefact
 from service.store.database.tables import artefacts
-from service.store.files.artefacts import to_artefact
-from service.web.record.images import Capture, find_capture, further_of
+from service.web.record.images import Capture, find_capture, further_of, rig_cameras
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
-from service.web.record.recorded_rig import rig_cameras
-from service.web.security.guards import requires
+from service.web.security import requires
 from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["media"])

@@ -8,31 +8,27 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
 from service.core.protocol.models import Step
-from service.jobs.capture.live_summary import Suggestion
+from service.jobs.live_summary import Suggestion
 from service.people.control import Control
 from service.people.person import Person
 from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
-from service.web.record.board_images import BoardUse, board_uses
-from service.web.record.images import Capture, captures_of, step_to_show
-from service.web.record.recorded_rig import rig_cameras
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite, Site
+from service.web.record.images import BoardUse, Capture, board_uses, captures_of, rig_cameras, step_to_show
+from service.web.security import SignedInPerson, requires
+from service.web.site import CurrentSite, RunId, Site
 
 if TYPE_CHECKING:
-    from service.web.capture.cameras import CameraImage, SheetImage
     from service.web.capture.plan_drawing import PlanDrawing
-    from service.web.capture.view import StepViewpoint, Verdict, ViewpointRedo, ViewState
+    from service.web.capture.view import CameraImage, SheetImage, StepViewpoint, Verdict, ViewpointRedo, ViewState
 
 router = APIRouter(tags=["capture"])
 
-RunId = Annotated[str, Path(max_length=64)]
 Parts = Annotated[str, part_names("image", "plan", "sheet")]
 SHEET = 60  # images on one page of the contact sheet
 LISTED = 200  # viewpoints on one page of the table
@@ -237,7 +233,7 @@ def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) ->
 
 def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> ContactSheet:
     """A page of the contact sheet: images with something wrong first, then newest first."""
-    from service.web.capture.cameras import devices_in, sheet_image  # noqa: PLC0415
+    from service.web.capture.view import devices_in, sheet_image  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
     uses = board_uses(log.state, log.events, step.id)
@@ -263,8 +259,8 @@ def _image(
 ) -> ChosenImage:
     """The large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
-    from service.web.capture.cameras import camera_images  # noqa: PLC0415
-    from service.web.record.known_spheres import displayed_registration  # noqa: PLC0415
+    from service.web.capture.view import camera_images  # noqa: PLC0415
+    from service.web.record.outlines import displayed_registration  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
     cameras: list[CameraImage] = []

@@ -1,26 +1,192 @@
-"""The page of a run's data set, its pictures, and its coloured surfaces."""
+"""The page of a run's data set: its views and splits, previews made in the background, and the benchmark on it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi import Path as UrlPath
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
+from service.audit.background import ChildProcesses, ChildState
+from service.benchmark.records import SCENARIOS, BenchmarkResult, read_results
+from service.core.errors import DataError
 from service.core.gates.release import refuse_data_set
-from service.web.dataset.benchmark import FOLDER, benchmark_of
-from service.web.dataset.previews import CurrentPreviews
-from service.web.dataset.view import data_set_view
+from service.core.records.events import Event, EvidenceExported
+from service.core.run.state import RunState
+from service.dataset.preview_records import AT_LEAST, FILE_NAME, Preview, ViewPreview, read_preview
+from service.store.durable_effects import Clock
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
 from service.web.record.images import further_cameras_of
 from service.web.scene.pages import FRAME_HEADERS, Theme
-from service.web.security.guards import requires
-from service.web.site import CurrentSite
+from service.web.security import requires
+from service.web.site import CurrentSite, RunId
+
+FOLDER = "benchmark"
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """The results that belong to a run: those on one of the data sets that it has exported.
+
+    Attributes:
+        results: by method, dense before sparse.
+        best: smallest Chamfer distance of each scenario, mm.
+        problem: why they cannot be read; "".
+    """
+
+    results: tuple[BenchmarkResult, ...]
+    best: tuple[tuple[str, float], ...]
+    problem: str = ""
+
+
+def benchmark_of(data: Path, events: Sequence[Event]) -> Benchmark:
+    """The results in DIR/benchmark whose data set has the list of checksums that the run has recorded."""
+    exported = {e.payload.sha256 for e in events if isinstance(e.payload, EvidenceExported)}
+    try:
+        found = read_results(data / FOLDER) if exported else ()
+    except (DataError, OSError) as error:
+        return Benchmark((), (), str(error))
+    results = sorted(
+        (result for result in found if result.dataset_sha256 in exported),
+        key=lambda result: (result.method, SCENARIOS.index(result.scenario)),
+    )
+    scores = {
+        scenario: [r.score.chamfer_mm for r in results if r.scenario == scenario and r.score is not None]
+        for scenario in SCENARIOS
+    }
+    return Benchmark(tuple(results), tuple((name, min(values)) for name, values in scores.items() if values))
+
+
+_VERSION = "3"  # of what a preview holds
+_LOCK = Lock()
+
+
+class Previews:
+    """The previews of one data folder."""
+
+    def __init__(self, data: Path, clock: Clock) -> None:
+        self._data = data
+        self._children = ChildProcesses("service.web.dataset.process", "preview", clock)
+
+    def ready(self, state: RunState) -> Preview | None:
+        """What is ready of a completed run's preview. Begins to make it where nobody has; None: nothing is ready."""
+        found = read_preview(self._folder(state))
+        if (found is None or not found.whole) and self._children.state(state.run_id) is None:
+            self.make(state)
+        return found
+
+    def making(self, run_id: str) -> ChildState | None:
+        """The progress or the outcome of making the preview; None before the first time."""
+        return self._children.state(run_id)
+
+    def make(self, state: RunState) -> None:
+        """Make the preview of a completed run, unless that is under way."""
+        arguments = [str(self._data), state.run_id, str(self._folder(state))]
+        self._children.start(state.run_id, arguments, by="")
+
+    def wait(self, run_id: str, timeout_s: float) -> None:
+        """Wait until the making has ended."""
+        self._children.wait(run_id, timeout_s)
+
+    def file(self, state: RunState, name: str) -> Path | None:
+        """A file of the preview; None for a name that it does not have."""
+        path = self._folder(state) / name
+        return path if FILE_NAME.fullmatch(name) and path.is_file() else None
+
+    def _folder(self, state: RunState) -> Path:
+        # What a preview shows of a completed run cannot change: its registration was signed, its scan is evidence.
+        return self._data / "cache" / "dataset" / f"{state.run_id}-{state.completed_sha256[:16]}-{_VERSION}"
+
+
+def _previews(request: Request, site: CurrentSite) -> Previews:
+    state = request.app.state
+    with _LOCK:
+        if not hasattr(state, "previews"):
+            state.previews = Previews(site.data, site.store.clock)
+        found: Previews = state.previews
+    return found
+
+
+CurrentPreviews = Annotated[Previews, Depends(_previews)]
+
+
+SPLITS = ("dense", "sparse", "train", "test")
+SPLIT_WORDS = {
+    "dense": "all views",
+    "sparse": "a few that together see most of the surface",
+    "train": "to learn from",
+    "test": "to judge by, every eighth",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SplitTab:
+    """A split that can be chosen."""
+
+    name: str
+    words: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class DataSetView:
+    """The page.
+
+    Attributes:
+        views: of the chosen split.
+        split: the chosen one.
+        splits: all.
+        chosen: the view that is enlarged; None: there is none yet.
+        before, after: names of its neighbours in the split; "" at the ends.
+        done: views whose pictures are ready.
+        total: of all views.
+        crops: of the views of the split.
+        covered: (at least so many views, share of the surface).
+    """
+
+    views: tuple[ViewPreview, ...]
+    split: str
+    splits: tuple[SplitTab, ...]
+    chosen: ViewPreview | None
+    before: str
+    after: str
+    done: int
+    total: int
+    crops: int
+    covered: tuple[tuple[int, float], ...]
+
+
+def data_set_view(preview: Preview, split: str, view: str) -> DataSetView:
+    """The page for a chosen split and view; the first of the split if the name is none of its views."""
+    members = tuple(shown for shown in preview.views if split in shown.splits)
+    names = [shown.name for shown in members]
+    at = names.index(view) if view in names else 0
+    return DataSetView(
+        views=members,
+        split=split,
+        splits=tuple(SplitTab(name, SPLIT_WORDS[name], _count(preview, name)) for name in SPLITS),
+        chosen=members[at] if members else None,
+        before=names[at - 1] if at > 0 else "",
+        after=names[at + 1] if at + 1 < len(names) else "",
+        done=sum(shown.ready for shown in preview.views),
+        total=len(preview.views),
+        crops=sum(len(shown.crops) for shown in members),
+        covered=() if preview.coverage is None else tuple(zip(AT_LEAST, preview.coverage.shares, strict=True)),
+    )
+
+
+def _count(preview: Preview, split: str) -> int:
+    return sum(split in shown.splits for shown in preview.views)
+
 
 router = APIRouter(tags=["dataset"])
 
-RunId = Annotated[str, Path(max_length=64)]
 Split = Annotated[Literal["dense", "sparse", "train", "test"], Query()]
 _READ = [Depends(requires("read"))]
 _TYPES = {"jpg": "image/jpeg", "webp": "image/webp"}
@@ -73,7 +239,7 @@ def make_preview(site: CurrentSite, previews: CurrentPreviews, run_id: RunId) ->
 
 @router.get("/runs/{run_id}/dataset/pictures/{name}", name="data_set_picture", dependencies=_READ)
 def picture(
-    site: CurrentSite, previews: CurrentPreviews, run_id: RunId, name: Annotated[str, Path(max_length=80)]
+    site: CurrentSite, previews: CurrentPreviews, run_id: RunId, name: Annotated[str, UrlPath(max_length=80)]
 ) -> FileResponse:
     """A picture of the preview."""
     path = previews.file(site.run(run_id).state, name)

@@ -8,14 +8,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from service.audit.background.child_process import Progress, report
+from service.audit.background import Progress, report
 from service.compute.resources import compute_in_background
 
 
 def preview(data: Path, run_id: str, folder: Path, progress: Progress) -> str:
     """Make the preview of a run in a folder. Returns the folder's name. Raises OrthocaptureError."""
     from service.audit.record.run import read_run  # noqa: PLC0415 - these load the numerics
-    from service.dataset.preview.making import make_preview  # noqa: PLC0415
+    from service.dataset.preview import make_preview  # noqa: PLC0415
 
     progress("reading the run", 0, 0)
     make_preview(read_run(data, run_id).summary(), folder, progress)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from fastapi import APIRouter, Depends, Form, Path, Query, Request
+from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
 from service.core.protocol.models import Step
@@ -17,15 +17,14 @@ from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.images import step_to_show
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite, Site
+from service.web.security import SignedInPerson, requires
+from service.web.site import CurrentSite, RunId, Site
 
 if TYPE_CHECKING:
     from service.web.handheld.view import HandheldView
 
 router = APIRouter(tags=["capture by hand"])
 
-RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
 Parts = Annotated[str, part_names("way", "image", "plan", "overlay")]
 

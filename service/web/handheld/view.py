@@ -15,13 +15,11 @@ from service.core.protocol.models import Protocol, Step
 from service.core.recorded_devices import recorded_report
 from service.core.records.events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
-from service.jobs.capture import hand_board, hand_view
-from service.jobs.looks import image_of
-from service.jobs.records import Matrix
-from service.jobs.surfaces import coverage_points
+from service.jobs import coverage_points, hand_board, hand_view
+from service.jobs.records import Matrix, image_of
 from service.run_record import RunRecord
 from service.steps.handheld import failure_words
-from service.web.page.run_words import limit
+from service.web.page.run_frame import limit
 from service.web.record.images import captures_of
 
 SIZE = 480.0  # of the drawing, which is square

@@ -1,4 +1,4 @@
-"""The first page: runs under way and recorded, and protocols to start."""
+"""The first pages: runs under way and recorded, protocols to start or to print, and two runs side by side."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import BaseModel, Field
 
+from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
 from service.audit.runs.search import RESULT_WORDS, RESULTS, RunSearch, find_runs
-from service.core.errors import OrthocaptureError
-from service.core.protocol.models import LoadedProtocol, load_protocol
-from service.core.records.entered import RunAbout
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.gates.measure_names import measure_name
+from service.core.protocol.models import LoadedProtocol, Protocol, irreversible_warning, load_protocol
+from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.core.records.events import RunStarted
 from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
-from service.store.files.space_used import forecast_of
+from service.store.disk_space import forecast_of
 from service.store.records import RunRow
 from service.web.page.rendering import render
 from service.web.page.robot_banner import robot_banner
-from service.web.page.run_frame import driven_frames
-from service.web.page.run_standing import run_standing
-from service.web.security.guards import SignedInPerson, requires
+from service.web.page.run_frame import driven_frames, limit, run_frame, run_standing
+from service.web.security import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["home"])
@@ -200,3 +201,108 @@ def startable_of(name: str, site: Site) -> StartableProtocol:
         return StartableProtocol(name, loaded, "", words, standing, tuple(changes))
     except OrthocaptureError as error:
         return StartableProtocol(name, None, str(error))
+
+
+_KNOWN = 20  # entries of earlier runs that a field offers
+
+
+@router.get("/start", name="start_form", dependencies=[Depends(requires("read"))])
+def start_form(
+    request: Request, site: CurrentSite, person: SignedInPerson, protocol: Annotated[str, Query(max_length=200)]
+) -> HTMLResponse:
+    """Fields of a new run of one protocol file; the site is filled in as in the run before."""
+    if protocol not in {path.name for path in site.protocol_files()}:
+        raise ConfigurationError(
+            f"there is no protocol file {protocol!r}",
+            where=str(site.protocols),
+            remedy="Choose one of the first page",
+        )
+    earlier = [run.about for run in find_runs(site.store, RunSearch())]
+    return render(
+        request,
+        "home/start.html.j2",
+        p=startable_of(protocol, site),
+        rig=site.rig.section,
+        place=next((about.site for about in earlier if about.site), ""),
+        operator=person.full_name,
+        known={field: _known(earlier, field) for field in ("specimen", "purpose", "site")},
+        line=LINE_CHARACTERS,
+        longest=TEXT_CHARACTERS,
+    )
+
+
+def _known(earlier: list[RunAbout], field: str) -> list[str]:
+    """What was entered before, newest first, each once."""
+    return list(dict.fromkeys(value for about in earlier if (value := str(getattr(about, field)))))[:_KNOWN]
+
+
+@router.get("/protocols/{file}/checklist", name="protocol_checklist", dependencies=[Depends(requires("read"))])
+def protocol_checklist(
+    request: Request, site: CurrentSite, file: Annotated[str, Path(max_length=200)]
+) -> HTMLResponse:
+    """Show the checklist of a protocol that can be started. Raises ConfigurationError for any other file."""
+    known = {path.name: path for path in site.protocol_files()}
+    if file not in known:
+        raise ConfigurationError(f"there is no protocol file {file!r}", where="protocols", remedy="Go to the runs")
+    loaded = load_protocol(known[file], params_models())
+    return _page(request, loaded.protocol, loaded.sha256)
+
+
+@router.get("/runs/{run_id}/checklist", name="run_checklist", dependencies=[Depends(requires("read"))])
+def run_checklist(request: Request, site: CurrentSite, run_id: Annotated[str, Path(max_length=64)]) -> HTMLResponse:
+    """Show the checklist of the protocol that a run began with."""
+    log = site.run(run_id)
+    root = log.events[0].payload
+    assert isinstance(root, RunStarted)  # checked when the run was read
+    return _page(request, log.protocol, root.protocol_sha256, run_id=run_id, frame=run_frame(site, run_id))
+
+
+def _page(
+    request: Request, protocol: Protocol, sha256: str, *, run_id: str = "", frame: object = None
+) -> HTMLResponse:
+    steps = [
+        {
+            "step": step,
+            "paragraphs": [" ".join(part.split()) for part in step.instructions.split("\n\n") if part.strip()],
+            "limits": [
+                f"{measure_name(gate.measure)} {limit(gate.min, gate.max, gate.unit)}"
+                for gate in step.gates
+                if gate.measure != "checklist_items_open"
+            ],
+            "warning": irreversible_warning(protocol, step) if step.irreversible else "",
+        }
+        for step in protocol.steps
+    ]
+    return render(
+        request, "home/checklist.html.j2", frame=frame, protocol=protocol, sha256=sha256, steps=steps, run_id=run_id
+    )
+
+
+_OFFERED = 200  # runs to choose from
+
+
+@router.get("/compare", name="compare", dependencies=[Depends(requires("read"))])
+def compare_page(
+    request: Request, site: CurrentSite, run: Annotated[list[str] | None, Query(max_length=64)] = None
+) -> HTMLResponse:
+    """Two runs, or the choice of two. Raises UnknownRunError."""
+    chosen = list(dict.fromkeys(run or []))
+    comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
+    offered = find_runs(site.store, RunSearch())[:_OFFERED]
+    missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
+    return render(
+        request,
+        "home/compare.html.j2",
+        c=comparison,
+        chosen=chosen,
+        offered=offered,
+        missing=missing,
+        measure_name=measure_name,
+    )
+
+
+def _run(site: Site, run_id: str) -> ComparedRun:
+    log = site.run(run_id)
+    root = root_of(log.events)
+    source = site.store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
+    return ComparedRun(run_id, root, log.protocol, source, tuple(log.events), log.state)

@@ -1,34 +1,43 @@
-"""Rendering: every page gets who looks, the theme, how the robots stand, and the tokens that its forms need."""
+"""Rendering: every page gets who looks, the theme, how the robots stand, its tokens; errors reveal no internals."""
 
 from __future__ import annotations
 
+import logging
+import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import quote
 
-from fastapi import Path, Request
-from fastapi.responses import HTMLResponse
+from fastapi import FastAPI, Path, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader, PrefixLoader, StrictUndefined, select_autoescape
 from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+
+from service.core.errors import ConfigurationError, DataError, IntegrityError, OrthocaptureError, ProtocolError
+from service.core.records.entered import RunAbout, about_rows
+from service.core.text.words import counted, local_time
+from service.people import person as people
+from service.store.records import UnknownRunError
+from service.web.page.robot_banner import LOST
+from service.web.page.run_frame import driven_frames
+from service.web.security import add_safety_headers, token_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from service.audit.record.event_rows import EventRow
-
-from service.core.records.entered import RunAbout, about_rows
-from service.core.text.words import counted, local_time
-from service.web.page.robot_banner import LOST
-from service.web.page.run_frame import driven_frames
+    from service.audit.record.rows import EventRow
 
 _FOLDERS = (
     "audit",
     "calibration",
     "capture",
     "dataset",
-    "evidence",
     "handheld",
     "home",
     "page",
@@ -96,3 +105,144 @@ def render(
         **more,
     )
     return HTMLResponse(text, status_code=status)
+
+
+_log = logging.getLogger("orthocapture.web")
+SAFE = "What was captured and recorded before is safe; this request changed nothing."
+UNSURE = "What was recorded before is safe. Look at the page again to see whether this request had an effect."
+
+# The first class that an error is an instance of; everything else is a conflict with the present state (409).
+_STATUS: tuple[tuple[type[OrthocaptureError], int], ...] = (
+    (people.NotSignedInError, 401),
+    (people.SignInRefusedError, 401),
+    (people.PinRefusedError, 403),
+    (people.NotAllowedError, 403),
+    (people.LinkError, 404),
+    (UnknownRunError, 404),
+    (people.AccountError, 422),
+    (people.ScreenLockedError, 423),
+    (people.TooManyTriesError, 429),
+    (ConfigurationError, 422),
+    (DataError, 422),
+    (ProtocolError, 422),
+)
+_WORDS = {
+    400: ("the request cannot be read", "Load the page again and repeat"),
+    404: ("there is no such page", "Go to the first page and choose from there"),
+    405: ("this address does not do that", "Go to the first page and choose from there"),
+    408: ("the request did not arrive in time", "Check the network, then send it again"),
+    413: ("the request is too large", "Send less"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PageProblem:
+    """An error in the words of the page and of the JSON body."""
+
+    status: int
+    what: str
+    where: str
+    remedy: str
+    safe: str
+    reference: str = ""
+
+
+def status_of(error: OrthocaptureError) -> int:
+    """The HTTP status that an error means."""
+    return next((status for kind, status in _STATUS if isinstance(error, kind)), 409)
+
+
+def install_errors(app: FastAPI) -> None:
+    """Register the handlers."""
+    app.add_exception_handler(OrthocaptureError, _expected)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def wants_json(request: Request) -> bool:
+    """Whether the client reads JSON rather than pages."""
+    accepted = request.headers.get("accept", "")
+    return "application/json" in accepted and "text/html" not in accepted
+
+
+def respond(request: Request, problem: PageProblem, headers: dict[str, str] | None = None) -> Response:
+    """A problem as page or as JSON."""
+    if wants_json(request):
+        return JSONResponse(asdict(problem), status_code=problem.status, headers=headers)
+    _recognise(request)
+    response = render(request, "page/error.html.j2", status=problem.status, problem=problem)
+    response.headers.update(headers or {})
+    return response
+
+
+def _recognise(request: Request) -> None:
+    """Who looks at the page of an error that came before any guard, such as an address that does not exist."""
+    site = request.app.state.site
+    if hasattr(request.state, "person"):
+        return
+    with suppress(OrthocaptureError):  # the page of an error shows what it can
+        request.state.person = site.people.person(
+            token_of(request, site), idle_lock_s=site.idle_lock_s, deliberate=False
+        )
+
+
+def _expected(request: Request, error: Exception) -> Response:
+    if not isinstance(error, OrthocaptureError):
+        raise error
+    if isinstance(error, people.NotSignedInError) and request.method == "GET" and not wants_json(request):
+        return RedirectResponse(f"/sign-in?next={quote(_asked_for(request), safe='/')}", status_code=303)
+    safe = (
+        "Do not go on before this is understood: evidence does not verify. Nothing was changed."
+        if isinstance(error, IntegrityError)
+        else SAFE
+    )
+    problem = PageProblem(status_of(error), error.what, error.where, error.remedy, safe)
+    headers = {"Retry-After": f"{error.wait_s:.0f}"} if isinstance(error, people.TooManyTriesError) else None
+    return respond(request, problem, headers)
+
+
+def _asked_for(request: Request) -> str:
+    address = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
+    return address if len(address) <= 400 else "/"
+
+
+def _invalid(request: Request, error: Exception) -> Response:
+    if not isinstance(error, RequestValidationError):
+        raise error
+    # The rejected values themselves are left out: one of them may be a password.
+    details: Sequence[Any] = error.errors()
+    places = [".".join(str(part) for part in detail["loc"][1:]) or str(detail["loc"][0]) for detail in details]
+    words = [f"{place}: {detail['msg'].lower()}" for place, detail in zip(places, details, strict=True)]
+    problem = PageProblem(
+        422,
+        "the form is not complete or not valid",
+        "; ".join(words[:5]),
+        "Correct the fields and send it again",
+        SAFE,
+    )
+    return respond(request, problem)
+
+
+def _http(request: Request, error: Exception) -> Response:
+    if not isinstance(error, HTTPException):
+        raise error
+    what, remedy = _WORDS.get(error.status_code, ("the request was refused", "Load the page again and repeat"))
+    problem = PageProblem(error.status_code, what, request.url.path, remedy, SAFE)
+    return respond(request, problem, dict(error.headers or {}))
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    reference = secrets.token_hex(4)
+    _log.error("reference %s: %s %s", reference, request.method, request.url.path, exc_info=error)
+    problem = PageProblem(
+        500,
+        "the software has made a mistake",
+        request.url.path,
+        f"Tell the administrator the reference {reference}; the log has the details",
+        UNSURE,
+        reference,
+    )
+    response = respond(request, problem)
+    add_safety_headers(response.headers, request.url.path)  # this one leaves outside of the Shield
+    return response

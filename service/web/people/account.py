@@ -11,12 +11,10 @@ from pydantic import BaseModel, Field
 from service.core.errors import OrthocaptureError
 from service.people.person import AccountError, AccountJustChangedError, SignInRefusedError
 from service.people.tries import on_screen_of
-from service.web.page.errors import status_of, wants_json
-from service.web.page.rendering import render
+from service.web.page.rendering import render, status_of, wants_json
 from service.web.people import administration
 from service.web.people.administration import utc_of
-from service.web.security.guards import SignedInPerson, clear_cookie, requires, set_cookie, token_of
-from service.web.security.shield import Limiter
+from service.web.security import Limiter, SignedInPerson, clear_cookie, requires, set_cookie, token_of
 from service.web.site import CurrentSite
 
 router = APIRouter(tags=["people"])

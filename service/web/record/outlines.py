@@ -1,11 +1,15 @@
-"""What is drawn over an image: outlines of its spheres, identified as far as that is possible so far."""
+"""What is drawn over an image: outlines of its spheres, identified by the spheres and poses that are known so far."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_from_record
@@ -13,15 +17,124 @@ from service.compute.poses.camera_files import read_camera_json
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs import jobs_of
+from service.core.protocol.step_params import Gives
 from service.core.units import metres
 from service.dataset.further_cameras import further_pose
-from service.dataset.registrations import further_cameras
-from service.jobs.capture import further_view, live_view
+from service.dataset.registrations import best_registration, further_cameras, registrations
+from service.dataset.summary import control_centres, control_scan, registered_scan
+from service.jobs import further_view, live_view, locate_spheres
+from service.jobs.records import Matrix, SpheresFound
+from service.jobs.register import Registration
 from service.run_record import RunRecord
 from service.web.record.images import Capture, further_of
-from service.web.record.known_spheres import Sphere, ct_spheres, displayed_registration, scan_spheres
-from service.web.record.live_files import LiveOutlines, read_live_outlines, read_outlines
 from service.web.record.pictures import DrawnOutline
+
+SphereKind = Literal["registration", "control", "sphere"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A sphere with the label that pages and pictures show."""
+
+    label: str  # "3"; "C1" for a control sphere
+    kind: SphereKind  # "sphere": not known yet whether it is a registration or a control sphere
+    centre_m: tuple[float, float, float]
+    rms_mm: float | None = None  # of the surface points against the fitted sphere
+    radius_residual_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DisplayedRegistration:
+    """The registration that pages show: see service.dataset.registrations.best_registration."""
+
+    name: str
+    record: Registration
+    step: str
+
+
+def last_step(log: RunRecord, gives: Gives) -> str:
+    """The last step that gives this and has a result; "" if there is none."""
+    steps = (step.id for step in reversed(log.protocol.steps) if step.gives == gives)
+    return next((step for step in steps if log.state.steps[step].result), "")
+
+
+def displayed_registration(log: RunRecord) -> DisplayedRegistration | None:
+    """The registration to show; None before there is one."""
+    name = best_registration(log.protocol, log.state)
+    if name is None:
+        return None
+    record = registrations(log.protocol, log.state)[name]
+    return DisplayedRegistration(name, record, last_step(log, "registrations"))
+
+
+def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:
+    """Spheres of the registered scan, and the control spheres, in its frame."""
+    scan = _found_in(log, registered_scan(log.protocol, log.state))
+    if not scan.spheres_m:
+        return ()
+    before = control_scan(log.protocol)
+    control = _found_in(log, before) if before else SpheresFound(spheres_m=())
+    extra = control_centres(scan.spheres_m, control.spheres_m)
+    return (*_numbered(scan, "registration"), *(Sphere(f"C{i}", "control", c) for i, c in enumerate(extra)))
+
+
+def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
+    """All spheres of the CT, in its frame; the CT does not show which of them are removed later."""
+    return _numbered(_found_in(log, last_step(log, "ct_surface")), "sphere")
+
+
+def _found_in(log: RunRecord, step: str) -> SpheresFound:
+    """What a step that imports a scan or a CT found; no spheres without such a step, or before it has a result."""
+    result = log.state.steps[step].result if step in log.state.steps else {}
+    return locate_spheres.KIND.read_answer(result) if result else SpheresFound(spheres_m=())
+
+
+def _numbered(found: SpheresFound, kind: SphereKind) -> tuple[Sphere, ...]:
+    measured = found.details.spheres or (None,) * len(found.spheres_m)
+    return tuple(
+        Sphere(str(i), kind, centre)
+        if sphere is None
+        else Sphere(str(i), kind, centre, sphere.rms_mm, sphere.radius_residual_mm)
+        for i, (centre, sphere) in enumerate(zip(found.spheres_m, measured, strict=False))
+    )
+
+
+OutlineRecord = dict[str, object]  # as service.compute.markers.records writes it
+_OUTLINES_BY_VIEWPOINT = TypeAdapter(dict[str, tuple[OutlineRecord, ...]])
+
+
+class LivePose(BaseModel):
+    """Where an image was taken, as the job `live_view` found it; T_base_scan is None while it is not known."""
+
+    model_config = ConfigDict(frozen=True)
+
+    station: str
+    T_base_camera: Matrix
+    T_base_scan: Matrix | None
+
+
+class LiveOutlines(LivePose):
+    """Add the outlines of the spheres that the job found in the image."""
+
+    outlines: tuple[OutlineRecord, ...]
+
+
+@lru_cache(maxsize=512)
+def read_live_pose(path: Path) -> LivePose:
+    """The pose in a file of a job `live_view`; cached, because an artefact never changes under its name."""
+    return LivePose.model_validate_json(path.read_bytes())
+
+
+@lru_cache(maxsize=8)
+def read_live_outlines(path: Path) -> LiveOutlines:
+    """A file of a job `live_view`, with its outlines."""
+    return LiveOutlines.model_validate_json(path.read_bytes())
+
+
+@lru_cache(maxsize=8)
+def read_outlines(path: Path) -> Mapping[str, tuple[OutlineRecord, ...]]:
+    """A file of a job `detect_spheres`: the outlines in each image, by viewpoint."""
+    return _OUTLINES_BY_VIEWPOINT.validate_json(path.read_bytes())
 
 
 @dataclass(frozen=True, slots=True)

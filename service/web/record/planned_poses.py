@@ -16,7 +16,7 @@ from service.steps.context import StationLayout
 from service.steps.kinds import calibration
 from service.steps.notes import BOARD_POSES, SUGGESTION, board_plans, suggested_views
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
-from service.web.record.recorded_rig import recorded_rig_section
+from service.web.record.images import recorded_rig_section
 
 Vector = tuple[float, float, float]
 _lock = Lock()

@@ -1,11 +1,12 @@
-"""What people do to a run: start, tick, confirm, sign, redo, skip, pause, resume, abort, end a computation."""
+"""What people do to a run: start, tick, confirm, sign, redo, skip, pause, resume, abort, and take control of it."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path
 from fastapi.responses import RedirectResponse
+from pydantic import BaseModel, Field
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import full_reason, load_protocol
@@ -20,6 +21,7 @@ from service.core.records.events import (
     JobFailed,
     JobFinished,
     OperatorAction,
+    OperatorVerb,
     RecordedView,
     RobotSeen,
     SessionStarted,
@@ -27,7 +29,7 @@ from service.core.records.events import (
 )
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import RunState, lost_arms
-from service.core.text.words import reason_of
+from service.core.text.words import REASON_CHARACTERS, reason_of
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
 from service.people.control import Control
@@ -39,11 +41,121 @@ from service.run_acts import DECIDE_AGAIN, cancel_computation, out_of_date, see_
 from service.run_record import RunRecord
 from service.run_start import record_refusal, require_rig_free, require_runnable, start_run
 from service.steps import params_models
-from service.web.run.forms import ActionForm, Reason, RunId, StartForm, back_to
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite, Site
+from service.web.security import SignedInPerson, requires
+from service.web.site import CurrentSite, RunId, Site
+
+Reason = Annotated[str, Form(max_length=REASON_CHARACTERS)]
+
+
+class StartForm(BaseModel):
+    """What a run is begun with: a protocol file, and what people enter about the run, of which it needs the specimen.
+
+    A protocol whose content was changed without a new version also needs a reason and a password.
+    """
+
+    protocol: str = Field(max_length=200)
+    reason: str = Field("", max_length=REASON_CHARACTERS)
+    password: str = Field("", max_length=1000)
+    specimen: str = Field("", max_length=2000)
+    purpose: str = Field("", max_length=2000)
+    site: str = Field("", max_length=2000)
+    operator: str = Field("", max_length=2000)
+    text: str = Field("", max_length=20_000)
+
+
+class ActionForm(BaseModel):
+    """An action on a run.
+
+    Attributes:
+        verb: the action.
+        step: identifier of the step; "" for the current one.
+        current: the step at which the run was, as the page showed it; a redo is of another one.
+        attempt: of that step, as the page showed it.
+        viewpoint: that is redone; "" for the whole step.
+        replaces: number of the event whose image of the viewpoint the page said is replaced; 0 for none.
+        moves: whether the page said that the robot then drives there at once.
+        preset: a reason chosen from the list.
+        reason: words that are added to it.
+        meaning: what a signature stands for.
+        known_by: what `password` holds: the password, or a PIN or badge where the site allows them for signatures.
+        password: see `known_by`.
+        account: of the person who accepts, where that is not the person who is signed in.
+        signed_sha256: hash of the record that a signature or acceptance binds.
+        seen_seq: number of the last event that the page showed.
+        back: page to return to; "" for the run's page.
+    """
+
+    verb: OperatorVerb
+    step: str = Field("", max_length=200)
+    current: str = Field("", max_length=200)
+    attempt: int = Field(0, ge=0, le=2**31)
+    viewpoint: str = Field("", max_length=200)
+    replaces: int = Field(0, ge=0, le=2**31)
+    moves: bool = False
+    preset: str = Field("", max_length=2000)
+    reason: str = Field("", max_length=REASON_CHARACTERS)
+    meaning: str = Field("", max_length=2000)
+    known_by: KnownBy = "password"
+    password: str = Field("", max_length=1000)
+    account: str = Field("", max_length=200)
+    signed_sha256: str = Field("", max_length=200)
+    seen_seq: int = Field(0, ge=0, le=2**31)
+    back: Literal["", "capture"] = ""
+
+
+def back_to(run_id: str, page: str = "") -> RedirectResponse:
+    """Show a page of a run after a form was sent; "" is the run's own page."""
+    return RedirectResponse(f"/runs/{run_id}/{page}".rstrip("/"), status_code=303)
+
 
 router = APIRouter(tags=["acting"])
+
+Shown = Annotated[str, Form(max_length=64)]  # the screen of which the page spoke; "" for none
+
+
+@router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
+def take_control(
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Reason = "", holder: Shown = ""
+) -> RedirectResponse:
+    """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
+    _require_open(site, run_id)
+    control = Control(site.store)
+    if reason.strip():
+        control.take_over(run_id, person, reason, shown=holder)
+    else:
+        control.take(run_id, person, shown=holder)
+    return back_to(run_id)
+
+
+@router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
+def ask_for_control(site: CurrentSite, person: SignedInPerson, run_id: RunId, holder: Shown = "") -> RedirectResponse:
+    """Ask the one who has control to hand it over."""
+    _require_open(site, run_id)
+    Control(site.store).ask(run_id, person, shown=holder)
+    return back_to(run_id)
+
+
+@router.post("/runs/{run_id}/control/answer", name="answer_for_control", dependencies=[Depends(requires("operate"))])
+def answer_for_control(
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, grant: Annotated[bool, Form()], asker: Shown = ""
+) -> RedirectResponse:
+    """Hand control over to the screen that asked for it, or keep it."""
+    Control(site.store).answer(run_id, person, grant=grant, shown=asker)
+    return back_to(run_id)
+
+
+@router.post("/runs/{run_id}/control/release", name="release_control", dependencies=[Depends(requires("operate"))])
+def release_control(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
+    """Give control up; the run goes on and waits at its next question."""
+    Control(site.store).release(run_id, person)
+    return back_to(run_id)
+
+
+def _require_open(site: Site, run_id: str) -> None:
+    state = site.run(run_id).state
+    if state.terminal:
+        raise IllegalTransitionError(f"the run is {state.status}: there is nothing to control any more", where=run_id)
+
 
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]

@@ -1,44 +1,170 @@
-"""The guided screen of a run: one step at a time."""
+"""The guided screen of a run, one step at a time, with its notes and its news as server-sent events."""
 
 from __future__ import annotations
 
+import asyncio
+import json
+from collections.abc import AsyncGenerator, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Query, Request
-from fastapi.responses import HTMLResponse
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from markupsafe import Markup
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import UploadFile
 
+from service.core.errors import DataError, OrthocaptureError
 from service.core.gates.acceptance import AcceptedGate, accepted_gates
 from service.core.gates.release import loses_release
 from service.core.protocol.models import Reasons, Step
-from service.core.records.entered import about_rows
-from service.core.records.events import ControlTaken, Event, RunStarted
+from service.core.records.entered import NoteTaken, about_rows
+from service.core.records.events import ArtefactRef, ControlTaken, Event, RunStarted
 from service.dataset.registrations import evaluated, shared_adjustment_note
-from service.jobs.registration.evaluate import Row
-from service.monitor.snapshot import read_snapshot
+from service.jobs.evaluate import Row
+from service.monitor.snapshot import STALE_S, read_snapshot
+from service.notes import NotePhotograph, require_size, take_note
 from service.people.control import Control
 from service.people.person import Account, Person
 from service.rig import SigningSection
 from service.run_record import RunRecord, open_jobs, results_to_come
 from service.steps import step_kinds
+from service.store.disk_space import forecast_of
 from service.store.durable_effects import utc_text
-from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
-from service.web.page.run_frame import run_frame
-from service.web.record.recorded_rig import rig_cameras
-from service.web.run.notes import PageNote, notes_of
+from service.web.page.run_frame import coats_of, run_frame
+from service.web.record.images import rig_cameras
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite, Site
+from service.web.security import SignedInPerson, requires, token_of
+from service.web.site import CurrentSite, RunId, Site
 
 router = APIRouter(tags=["run"])
 
-RunId = Annotated[str, Path(max_length=64)]
+
+@dataclass(frozen=True, slots=True)
+class PageNote:
+    """A note as pages show it."""
+
+    seq: int
+    at_utc: str
+    by: str
+    step: str
+    text: str
+    photograph: ArtefactRef | None
+
+
+def notes_of(events: Iterable[Event], step: str = "") -> tuple[PageNote, ...]:
+    """The notes of a run, or of one of its steps, in order."""
+    return tuple(
+        PageNote(event.seq, event.at_utc, event.actor, note.step, note.text, note.photograph)
+        for event in events
+        if isinstance(note := event.payload, NoteTaken) and step in ("", note.step)
+    )
+
+
+@router.post("/runs/{run_id}/notes", name="take_note", dependencies=[Depends(requires("operate"))])
+async def take(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
+    """Record a note. This does not need control of the run: anybody who works on it may write one.
+
+    The form is read here, after the guard. As parameters of the route it would be read before the guard, and clients
+    that are not signed in could fill the disk with photographs.
+    """
+    async with request.form() as form:
+        text, step = (value if isinstance(value := form.get(name), str) else "" for name in ("text", "step"))
+        file = form.get("photograph")
+        photograph = None
+        if isinstance(file, UploadFile) and (file.filename or file.size):
+            name = file.filename or "photograph"
+            require_size(file.size or 0, name)
+            photograph = NotePhotograph(await file.read(), name)
+        elif isinstance(file, str) and file:
+            raise DataError("the photograph did not arrive", where=run_id, remedy="Load the page again and repeat")
+    log = await run_in_threadpool(site.run, run_id)
+    event = await run_in_threadpool(
+        lambda: take_note(log, text, photograph, step=step, actor=person.account, via="web")
+    )
+    note = event.payload
+    back = f"?step={note.step}" if isinstance(note, NoteTaken) and note.step != log.state.current else ""
+    return RedirectResponse(f"/runs/{run_id}{back}", status_code=303)
+
+
+_LOOK_S = 0.3
+_BEAT_S = 1.5  # a page that hears nothing for twice this says that the connection is lost
+_CHECK_S = 5.0
+
+
+@router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
+async def stream(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> StreamingResponse:
+    """`changed` with {"seq", "monitor", "locked"} whenever one of them has changed.
+
+    `replaced` ends the stream: the sign-in has opened more streams than it may have, and this is the oldest.
+    """
+    await run_in_threadpool(site.store.head, run_id)  # an unknown run is refused before the stream begins
+    return StreamingResponse(
+        _news(request, site, person.screen, run_id),
+        media_type="text/event-stream",
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+    )
+
+
+async def _news(request: Request, site: Site, screen: str, run_id: str) -> AsyncGenerator[str]:
+    told: tuple[int, int, bool] | None = None
+    clock = site.store.clock
+    beat_s = checked_s = clock.monotonic_s()
+    token, locked = token_of(request, site), False
+    with site.streams.opened(screen) as place:
+        while not await request.is_disconnected():
+            now_s = clock.monotonic_s()
+            if place.replaced:
+                yield "event: replaced\ndata: {}\n\n"
+                return
+            if now_s - checked_s > _CHECK_S:
+                checked_s = now_s
+                person = await run_in_threadpool(_signed_in, site, token)
+                if person is None:
+                    yield "event: signed_out\ndata: {}\n\n"
+                    return
+                locked = person.locked
+            news = (*await run_in_threadpool(newest, site, run_id), locked)
+            if news != told:
+                told, beat_s = news, now_s
+                data = {"seq": news[0], "monitor": news[1], "locked": locked}
+                yield f"event: changed\ndata: {json.dumps(data)}\n\n"
+            elif now_s - beat_s > _BEAT_S:
+                beat_s = now_s
+                yield "event: beat\ndata: {}\n\n"
+            await asyncio.sleep(_LOOK_S)
+
+
+def _signed_in(site: Site, token: str) -> Person | None:
+    """Who sits there; a screen that was left alone is locked by this look."""
+    return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
+
+
+def newest(site: Site, run_id: str) -> tuple[int, int]:
+    """The last event, and a number that changes with the runner's reports, its silence, control, and a coat's age.
+
+    Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.
+    """
+    now_utc_s = site.store.clock.utc_s()
+    snapshot = read_snapshot(site.data, run_id, now_utc_s)
+    silent = snapshot.age_s(now_utc_s) // STALE_S if snapshot.stale(now_utc_s) else 0
+    shown = (silent, Control(site.store).holder(run_id), *_ages(site, run_id), *snapshot.shown())
+    return site.store.head(run_id), hash(shown)
+
+
+def _ages(site: Site, run_id: str) -> list[str]:
+    """What the pages say of a coat's age; nothing of a run that cannot be read, which its pages say themselves."""
+    try:
+        return [coat.title for coat in coats_of(site, site.run(run_id))]
+    except OrthocaptureError:
+        return []
+
+
 Name = Annotated[str, Query(max_length=64)]
 Parts = Annotated[str, part_names("banner", "control", "vitals", "step", "actions", "dialogs", "side")]
 _DRAWINGS = files("service.web.run") / "drawings"

@@ -10,7 +10,7 @@ from service.core.disk_space import Forecast
 from service.core.gates.acceptance import acceptors, demanded_role, dependent_steps, depends_on, failed_gates
 from service.core.protocol.models import Protocol, Step, irreversible_warning
 from service.core.records.events import Event, FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
-from service.core.recovery import WayOn, takes_words
+from service.core.recovery import WayOn, planned_views, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.decide import AskOperator, lapsed_words
 from service.core.run.expected import EarlierTimes, away_words, run_words, step_words, tries_words, work_words
@@ -19,22 +19,20 @@ from service.core.text.words import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.run_record import OpenJob
-from service.web.page.run_standing import run_standing
-from service.web.page.run_words import (
+from service.web.page.run_frame import (
     count,
     drawing_of,
     figure_line,
     needs,
     phase_words,
-    planned_views,
+    run_standing,
     sentence,
     station_of,
     stopped_words,
     way_words,
     will_happen,
 )
-from service.web.record.board_images import unused_count
-from service.web.run.figures import capture_progress, gate_lines, readings
+from service.web.record.images import unused_count
 from service.web.run.view_records import (
     Acceptance,
     ChecklistItem,
@@ -51,6 +49,9 @@ from service.web.run.view_records import (
     StepTrouble,
     StepView,
     Viewer,
+    capture_progress,
+    gate_lines,
+    readings,
 )
 
 NOT_MEASURED: EarlierTimes = {}

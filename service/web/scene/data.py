@@ -1,4 +1,4 @@
-"""The scene of a run as far as it is known: registered, provisionally registered during the capture, or planned."""
+"""The scene of a run as far as it is known, registered or planned, for the 3D view and in words and numbers."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from service.compute.evaluation.error_budget import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
 from service.core.text.words import counted
-from service.core.units import metres, mm
-from service.dataset.further_cameras import further_poses
-from service.dataset.registered_scan import registered_scan
+from service.core.units import deg, metres, mm
+from service.dataset.further_cameras import KnownFurtherCamera, further_poses
 from service.dataset.registrations import registrations
-from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
-from service.jobs.capture import further_view
+from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated, viewing_frame
+from service.dataset.summary import registered_scan
+from service.jobs import further_view, fuse
 from service.jobs.records import Point
-from service.jobs.registration.register import Registration
-from service.jobs.surfaces import fuse
+from service.jobs.register import Registration
 from service.run_record import RunRecord
-from service.web.record.images import captures_of, further_of
-from service.web.record.known_spheres import (
+from service.web.record.images import captures_of, further_cameras_of, further_of
+from service.web.record.outlines import (
     DisplayedRegistration,
+    LivePose,
     Sphere,
     ct_spheres,
     displayed_registration,
     last_step,
+    read_live_pose,
     scan_spheres,
 )
-from service.web.record.live_files import LivePose, read_live_pose
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import nominal_T_flange_camera, planned_poses, station_of
 
@@ -300,3 +300,96 @@ def _load(path: Path) -> tuple[Array, NDArray[np.int64], MeshFacts]:
     vertices, faces, shown = counts
     x, y, z = size
     return points, triangles, MeshFacts(vertices, faces, shown, (x, y, z))
+
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRow:
+    """A camera pose; a planned one has not been taken yet."""
+
+    name: str
+    station: str
+    position_mm: Vector
+    tilt_deg: float  # of the optical axis from straight down
+    distance_mm: float  # from the middle of the spheres
+    planned: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SphereRow:
+    """A sphere."""
+
+    label: str
+    kind: str
+    position_mm: Vector
+    radius_residual_mm: float | None
+    rms_mm: float | None
+    images: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class StationRow:
+    """A robot base."""
+
+    name: str
+    position_mm: Vector
+    distance_mm: float  # from the middle of the spheres
+    cameras: int
+
+
+@dataclass(frozen=True, slots=True)
+class SceneTables:
+    """Everything on the page except the picture."""
+
+    frame: str
+    how: str
+    missing: tuple[str, ...]
+    cameras: tuple[CameraRow, ...]
+    spheres: tuple[SphereRow, ...]
+    stations: tuple[StationRow, ...]
+    further: tuple[KnownFurtherCamera, ...]
+    mesh: MeshFacts | None
+    error_at_spheres_mm: tuple[float, float] | None  # predicted, least and most
+
+
+def scene_tables(log: RunRecord, data: Path) -> SceneTables:
+    """The tables; positions are in the frame that the record uses, not in that of the picture."""
+    now = scene_of(log)
+    T_view = viewing_frame(now.scene)
+    down, centre = -T_view[2, :3], -T_view[:3, :3].T @ T_view[:3, 3]
+    rows: list[CameraRow] = []
+    beside = [(poses, False) for poses in now.scene.further.values()]
+    for poses, planned in ((now.scene.cameras, False), (now.scene.planned, True), *beside):
+        for name, T in poses.items():
+            tilt = deg(float(np.arccos(np.clip(T[:3, 2] @ down, -1, 1))))
+            away = mm(float(np.linalg.norm(T[:3, 3] - centre)))
+            rows.append(CameraRow(name, now.scene.stations.get(name, ""), _mm(T[:3, 3]), tilt, away, planned))
+    stations = [
+        StationRow(
+            name,
+            _mm(T[:3, 3]),
+            mm(float(np.linalg.norm(T[:3, 3] - centre))),
+            sum(now.scene.stations.get(camera) == name for camera in now.scene.cameras),
+        )
+        for name, T in sorted(now.scene.bases.items())
+    ]
+    spheres = [
+        SphereRow(
+            s.label, s.kind, _mm(np.array(s.centre_m)), s.radius_residual_mm, s.rms_mm, now.sphere_images.get(s.label)
+        )
+        for s in now.spheres
+    ]
+    error = None
+    if now.registered is not None and now.spheres:
+        errors = predicted_error_mm(now.registered, np.array([s.centre_m for s in now.spheres]))
+        error = (float(errors.min()), float(errors.max()))
+    facts = mesh_facts(now, log, data)
+    cameras, about = tuple(rows), further_cameras_of(log)
+    return SceneTables(now.frame, now.how, now.missing, cameras, tuple(spheres), tuple(stations), about, facts, error)
+
+
+def _mm(point_m: Array) -> Vector:
+    x, y, z = (mm(float(v)) for v in point_m)
+    return x, y, z

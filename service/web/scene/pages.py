@@ -1,24 +1,65 @@
-"""The scene in 3D and as tables."""
+"""The scene in 3D and as tables, and the drawing of a region of the ground truth in it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Path, Query, Request
-from fastapi.responses import HTMLResponse
+from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
 
 from service.core.gates.acceptance import accepted_gates
+from service.jobs import fuse
 from service.people.control import Control
-from service.run_acts import drawing_step
+from service.run_acts import drawing_step, read_region, step_to_draw_for
+from service.run_record import RunRecord
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
-from service.web.scene.region import drawn_rows
-from service.web.security.guards import SignedInPerson, requires
-from service.web.site import CurrentSite
+from service.web.security import SignedInPerson, requires
+from service.web.site import CurrentSite, RunId
 
 router = APIRouter(tags=["scene"])
 
-RunId = Annotated[str, Path(max_length=64)]
+
+@dataclass(frozen=True, slots=True)
+class DrawnRow:
+    """A region that a person drew, for the page."""
+
+    by: str
+    source: str
+    corners: int
+    used: bool  # by the fusion whose result the run has
+
+
+def drawn_rows(log: RunRecord) -> tuple[DrawnRow, ...]:
+    """The regions drawn in a run, oldest first."""
+    rows: list[DrawnRow] = []
+    for found in log.state.drawn:
+        jobs = log.state.steps[found.region.step].jobs.values()
+        used = any(
+            job.kind == fuse.KIND.name and job.status == "finished" and job.enqueued_seq > found.seq for job in jobs
+        )
+        rows.append(DrawnRow(found.by, found.region.source, len(found.region.corners_m), used))
+    return tuple(rows)
+
+
+@router.post("/runs/{run_id}/scene/region", name="draw_region", dependencies=[Depends(requires("operate"))])
+def draw_region(
+    site: CurrentSite,
+    person: SignedInPerson,
+    run_id: RunId,
+    source: Annotated[Literal["ct", "scan"], Form()],
+    corners: Annotated[str, Form(max_length=40_000)],
+    along: Annotated[str, Form(max_length=400)],
+) -> RedirectResponse:
+    """Record a polygon that was drawn on the 3D view: corners and direction in the frame of the scan, metres."""
+    log = site.run(run_id)
+    Control(site.store).require(run_id, person)
+    region = read_region(step_to_draw_for(log), source, corners, along)
+    site.store.record(run_id, [region], actor=person.account)
+    return RedirectResponse(f"/runs/{run_id}/scene", status_code=303)
+
+
 Theme = Annotated[Literal["auto", "light", "dark"], Query()]
 # For documents in a sandboxed frame, which has its own origin, gets no cookies and loads nothing from elsewhere.
 # plotly compiles JavaScript at run time for its shaders, hence 'unsafe-eval'.
@@ -41,7 +82,7 @@ FRAME_HEADERS = {
 @router.get("/runs/{run_id}/scene", name="scene", dependencies=[Depends(requires("read"))])
 def scene(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> HTMLResponse:
     """The 3D view in its frame, and everything in it as tables."""
-    from service.web.scene.tables import scene_tables  # noqa: PLC0415 - mesh and matching, not needed to start
+    from service.web.scene.data import scene_tables  # noqa: PLC0415 - mesh and matching, not needed to start
 
     log = site.run(run_id)
     tables = scene_tables(log, site.data)

@@ -9,21 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview import findings, first_page
-from service.audit.overview.corrections import correct
 from service.audit.overview.digest import digests
+from service.audit.overview.findings import correct
 from service.audit.overview.signatures import signatures as signatures_of
-from service.audit.provenance.drawing import draw
-from service.audit.provenance.graph import graphs, origin
-from service.audit.record import artefact_queries, event_rows, event_search, run_rows
-from service.audit.record.event_search import EventFilter, EventPage
+from service.audit.provenance import draw, graphs, origin
+from service.audit.record import rows, search
+from service.audit.record.search import EventFilter, EventPage
 from service.core.errors import DataError
 from service.core.records.events import StepNote
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.run_start import recorded_run
-from service.store.errors import UnknownRunError
+from service.store.records import UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until
@@ -59,13 +58,13 @@ def test_digest_agrees_with_the_fold_after_a_redo_and_goes_on_from_where_it_was(
     with Store.open(tmp_path / "data") as store:
         computed = digests(store)
         first = computed.get(run, wait_s=60.0)
-        assert not isinstance(first, Progress)
+        assert not isinstance(first, PartialProgress)
         state = folded(store, run)
         assert (first.deviations, first.status) == (state.deviations, state.status)
         assert any(d.kind == "redo" for d in first.deviations)
         store.record(run, [StepNote(step="registration", attempt=1, note="later")], actor="runner")
         second = computed.get(run, wait_s=60.0)
-        assert not isinstance(second, Progress)
+        assert not isinstance(second, PartialProgress)
         assert second.seq == first.seq + 1
         assert second.facets.kinds["step_note"] == first.facets.kinds.get("step_note", 0) + 1
         with store.database.reading() as connection:
@@ -86,8 +85,8 @@ def test_digest_says_where_events_do_not_add_up(tmp_path: Path) -> None:
 
 def test_large_run_says_how_far_it_is_instead_of_waiting(store: Store, run: str) -> None:
     computed = digests(store)
-    assert isinstance(computed.get(run), Progress)
-    until(lambda: not isinstance(computed.get(run), Progress), "the digest", 20, every_s=0.02)
+    assert isinstance(computed.get(run), PartialProgress)
+    until(lambda: not isinstance(computed.get(run), PartialProgress), "the digest", 20, every_s=0.02)
     computed.close()
 
 
@@ -96,7 +95,7 @@ def test_large_run_says_how_far_it_is_instead_of_waiting(store: Store, run: str)
 
 def page_of(store: Store, run: str, wanted: EventFilter, **where: int) -> EventPage:
     with store.database.reading() as connection:
-        return event_search.events_page(connection, run, wanted, **where)
+        return search.events_page(connection, run, wanted, **where)
 
 
 def every_page(store: Store, run: str, wanted: EventFilter) -> list[int]:
@@ -151,23 +150,23 @@ def test_pages_go_back_the_way_they_came(store: Store, run: str) -> None:
 def test_no_filter_breaks_the_search(store: Store, run: str, q: str, step: str, after: int, before: int) -> None:
     page = page_of(store, run, EventFilter(q=q, step=step), after=after, before=before)
     assert page.count is not None
-    assert len(page.rows) <= run_rows.PAGE
+    assert len(page.rows) <= rows.PAGE
 
 
 def test_every_event_shows_its_content_and_its_hash_holds(store: Store, run: str) -> None:
     events = store.events(run)
     with store.database.reading() as connection:
         for seq in (1, 2, len(events) // 2, len(events)):
-            row = event_rows.one_event(connection, run, seq)
+            row = rows.one_event(connection, run, seq)
             event = events[seq - 1]
             assert (row.sha256, row.previous_sha256) == (event.sha256, event.previous_sha256)
-            assert event_rows.computed_sha256(run, row) == row.sha256
-            assert event_rows.seq_of_hash(connection, run, event.sha256) == seq
+            assert rows.computed_sha256(run, row) == row.sha256
+            assert rows.seq_of_hash(connection, run, event.sha256) == seq
             assert row.payload == event.payload.model_dump(mode="json")
-        assert event_rows.seq_of_hash(connection, run, "f" * 64) is None
+        assert rows.seq_of_hash(connection, run, "f" * 64) is None
         for seq in (0, -1, len(events) + 1, 10**30):
             with pytest.raises(UnknownRunError):
-                event_rows.one_event(connection, run, seq)
+                rows.one_event(connection, run, seq)
 
 
 def test_events_missing_from_the_index_are_told(tmp_path: Path) -> None:
@@ -186,21 +185,21 @@ def test_artefacts_are_found_by_every_property(store: Store, run: str) -> None:
     one = next(a for a in every if a.viewpoint == "v00007" and a.ref.kind == "image")
     with store.database.reading() as connection:
         for wanted, expected in (
-            (artefact_queries.ArtefactFilter(), len(every)),
-            (artefact_queries.ArtefactFilter(kind="ct_slice"), SMALL.slices),
-            (artefact_queries.ArtefactFilter(device="robot"), SMALL.viewpoints + SMALL.redone_viewpoints),
-            (artefact_queries.ArtefactFilter(viewpoint="v00007"), 2),
-            (artefact_queries.ArtefactFilter(q=one.ref.sha256[:16]), 1),
-            (artefact_queries.ArtefactFilter(q="dsc00007 image"), 1),
-            (artefact_queries.ArtefactFilter(q="%"), 0),
-            (artefact_queries.ArtefactFilter(q="SC0000_"), 0),
+            (search.ArtefactFilter(), len(every)),
+            (search.ArtefactFilter(kind="ct_slice"), SMALL.slices),
+            (search.ArtefactFilter(device="robot"), SMALL.viewpoints + SMALL.redone_viewpoints),
+            (search.ArtefactFilter(viewpoint="v00007"), 2),
+            (search.ArtefactFilter(q=one.ref.sha256[:16]), 1),
+            (search.ArtefactFilter(q="dsc00007 image"), 1),
+            (search.ArtefactFilter(q="%"), 0),
+            (search.ArtefactFilter(q="SC0000_"), 0),
         ):
-            found = artefact_queries.artefacts_page(connection, run, wanted)
+            found = search.artefacts_page(connection, run, wanted)
             assert found.count == expected, wanted
-        last = artefact_queries.artefacts_page(connection, run, artefact_queries.ArtefactFilter(), page=10**9)
+        last = search.artefacts_page(connection, run, search.ArtefactFilter(), page=10**9)
         assert last.page == last.pages
         with pytest.raises(UnknownRunError):
-            artefact_queries.one_artefact(connection, run, "'; DROP TABLE artefacts")
+            search.one_artefact(connection, run, "'; DROP TABLE artefacts")
 
 
 def test_provenance_runs_from_scans_to_the_registration(tmp_path: Path) -> None:
@@ -209,7 +208,7 @@ def test_provenance_runs_from_scans_to_the_registration(tmp_path: Path) -> None:
         computed = graphs(store)
         graph = computed.get(run, wait_s=60.0)
         computed.close()
-        assert not isinstance(graph, Progress)
+        assert not isinstance(graph, PartialProgress)
         mesh, job = "file second_scan scan_mesh", "job second_scan locate_spheres"
         assert (mesh, job) in graph.edges
         # The sphere positions from the scan reach the registration as numbers, not as a file.
@@ -248,7 +247,7 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
         correct(store, run, of_seq=2, field="host", new="table 3", reason="again", actor="emmy")
         with store.database.reading() as connection:
             values = findings.corrected_values(connection, run)
-            original = event_rows.one_event(connection, run, 2)
+            original = rows.one_event(connection, run, 2)
         assert [(v.old, v.new, v.original, v.latest) for v in values] == [
             ("here", "table 2", "here", False),
             (1, 7, 1, True),

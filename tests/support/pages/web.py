@@ -25,9 +25,8 @@ from service.station import devices_of
 from service.store.durable_effects import Clock
 from service.store.store import Store
 from service.web.app import create_app
-from service.web.launch import Launcher
-from service.web.security.guards import cookie_name
-from service.web.site import Site
+from service.web.security import cookie_name
+from service.web.site import Launcher, Site
 from tests.support.processes.forked import pages_fork
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run

@@ -30,7 +30,7 @@ from types import SimpleNamespace
 from typing import Any, AnyStr, cast
 from unittest.mock import patch
 
-from service.audit.background import child_process
+from service.audit import background
 from tests.support.processes.zygote import COMMANDS, HOST, MOST_PASSED, OF_PAGES, OF_TESTS, SIMULATORS
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -218,7 +218,7 @@ def run(
 @contextmanager
 def pages_fork() -> Generator[None]:
     """Let what the pages of a site in this process start be forks, while the block lasts."""
-    with patch.object(child_process, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": Forked})):
+    with patch.object(background, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": Forked})):
         yield
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from docs.generate.jobs import jobs_text
 from docs.generate.steps import steps_text
-from service.audit.background.incremental import Progress
-from service.audit.provenance.drawing import draw
-from service.audit.provenance.graph import graphs
+from service.audit.background import PartialProgress
+from service.audit.provenance import draw, graphs
 from service.audit.record.run import read_run
 from service.audit.replay.replay import replay
 from service.core.protocol.models import parse_protocol
@@ -56,7 +55,7 @@ def main(folder: Path) -> None:
         checkpoint(web.store, bench.run_id)
         computed = graphs(web.store)
         graph = computed.get(bench.run_id, wait_s=60)
-        assert not isinstance(graph, Progress)
+        assert not isinstance(graph, PartialProgress)
         audit_page = _provenance_page(web, bench.run_id)
         computed.close()
     run = read_run(folder / "data", bench.run_id)

@@ -7,7 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.cli.run.ending import end_with_children
+from service.cli.run import end_with_children
 from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command
 

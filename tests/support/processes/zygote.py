@@ -31,15 +31,15 @@ from typing import Any, Literal, TextIO
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
 # What the pages start: modules of the program, each with those that it imports only once it needs them.
 OF_PAGES = {
-    "service.audit.export.formats": ("service.audit.export.posed",),
+    "service.audit.export.exports": ("service.audit.export.posed",),
     "service.audit.export.process": (
         "service.audit.export.posed",
         "service.audit.report.content",
-        "service.audit.report.output.html",
-        "service.audit.report.output.pdf",
+        "service.audit.report.output",
+        "service.audit.report.output",
     ),
-    "service.audit.verify.process": (),
-    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview.making"),
+    "service.audit.verify.verifications": (),
+    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview"),
 }
 VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
     "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",

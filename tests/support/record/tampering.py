@@ -7,10 +7,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from service.store.artefacts import record_sha256
 from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
 from service.store.events import event_sha256, parse_canonical
-from service.store.files.artefacts import record_sha256
 from service.store.journal.changes import every_row
 from service.store.journal.journal import Journal
 from service.store.journal.lines import NAME

@@ -36,7 +36,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
-from service.worker.calibration.records import hand_eye_record, intrinsics_record
+from service.worker.records import hand_eye_record, intrinsics_record
 from tests.support.boards.board_sessions import BOARD, Session, noisy_session
 from tests.support.pages.web import WebSite
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from service.audit.background.incremental import Progress
+from service.audit.background import PartialProgress
 from service.audit.overview.digest import Digest, digests
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import Step, load_protocol
@@ -310,5 +310,5 @@ def digest_of(store: Store, run: str) -> Digest:
     computed = digests(store)
     value = computed.get(run, wait_s=60.0)
     computed.close()
-    assert not isinstance(value, Progress)
+    assert not isinstance(value, PartialProgress)
     return value

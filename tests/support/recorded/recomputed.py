@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from service.audit.record.run import RecordedRun
-from service.audit.replay.scratch import ScratchStore
+from service.audit.replay.recomputed import ScratchStore
 from service.core.jobs import jobs_of, resolve
 from service.core.run.state import JobState
-from service.jobs.registration import register
+from service.jobs import register
 from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.cli.run.demo import true_errors_mm
+from service.cli.demo import true_errors_mm
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
 from service.store.store import Store

@@ -16,8 +16,8 @@ from service.compute.pixels.masks import WorldSphere, posts_below
 from service.compute.pixels.render import RayMesh, pixel_rays
 from service.compute.pixels.views import splits
 from service.core.geometry import Array, Transform, apply, inverse, look_at
-from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, PosedView
+from service.dataset.pixels import Photographs
+from service.dataset.records import DataSet, Mesh, PosedView
 
 CAMERA = CameraModel(160, 120, 190.0, 191.0, 78.0, 61.5, -0.12, 0.04, 8e-4, -5e-4)
 BOXES_M = np.array([[[-0.08, -0.03, 0.0], [0.08, 0.03, 0.03]], [[0.04, 0.03, 0.0], [0.08, 0.09, 0.05]]])

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.geometry import Array, apply, inverse
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.records import DataSet, PosedView
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.records import DataSet, PosedView
 from tests.support.scenes.posed import scene
 
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from service.compute.pixels.render import RayMesh
 from service.compute.pixels.views import splits
-from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, PosedView
+from service.dataset.pixels import Photographs
+from service.dataset.records import DataSet, Mesh, PosedView
 from tests.support.scenes.textured_scene import Slab, camera_of_width, render, ring_of_poses, slabs
 
 

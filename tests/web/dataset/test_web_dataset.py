@@ -16,8 +16,7 @@ import pytest
 from service.audit.record.run import read_run
 from service.benchmark.records import BenchmarkResult, ComputingEffort, Machine, Score
 from service.core.records.events import EvidenceExported
-from service.dataset.posed.of_run.data_set import data_set_of
-from service.dataset.preview.records import (
+from service.dataset.preview_records import (
     DecidedRegion,
     GroundTruthPreview,
     Preview,
@@ -25,8 +24,9 @@ from service.dataset.preview.records import (
     read_preview,
     write_preview,
 )
+from service.dataset.run_data_set import data_set_of
 from service.dataset.scene_view import decimated
-from service.web.dataset.previews import Previews
+from service.web.dataset.pages import Previews
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run
 from tests.support.recorded.unpacked_run import unpack_recorded_run

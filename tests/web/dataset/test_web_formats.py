@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.export.folder_zip import zip_chunks
+from service.audit.export.exports import zip_chunks
 from service.audit.export.process import export
 from service.audit.export.wanted import ExportRequest, WantedExport, keep_request
 from service.core.errors import IntegrityError
 from service.core.records.events import EvidenceExported
-from service.dataset.posed.exporter import exporters
-from service.dataset.posed.folder import SUMS
+from service.dataset.export_folder import SUMS
+from service.dataset.exporter import exporters
 from service.store.verification.verify import verify
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run

@@ -29,10 +29,9 @@ from service.monitor.snapshot import Snapshot, read_snapshot, write_snapshot
 from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.events import to_event
 from service.store.records import Checkpoint, Timestamp
-from service.store.signatures.checkpoints import key_fingerprint
-from service.store.signatures.keys import KeyFolder, public_bytes
+from service.store.signatures.checkpoints import KeyFolder, key_fingerprint, public_bytes
 from service.store.signatures.log import NAME, log_findings, read_log
-from service.store.signatures.log_copy import LogCopy
+from service.store.signatures.second_place import LogCopy
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import stamped_bytes, timestamp_findings
 from service.store.store import Store
@@ -372,7 +371,7 @@ TARGETS: tuple[Target, ...] = (
         pace=0.5,
     ),
     Target("signature_log", "service.store.signatures.log:log_findings", _log, _logs, JSON),
-    Target("signing_key", "service.store.signatures.keys:KeyFolder.load", _key, _keys, TEXT),
+    Target("signing_key", "service.store.signatures.checkpoints:KeyFolder.load", _key, _keys, TEXT),
     Target("event", "service.store.events:to_event", _event, _events, JSON),
     Target(
         "database", "service.store.verification.verify:verify", _database, _databases, BYTES, seconds=10.0, pace=0.05

@@ -22,10 +22,10 @@ from service.benchmark.table import table_markdown
 from service.compute.ground_truth.surface import Surface, read_ply, write_ply
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
 from service.core.text.files import parse_json
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.folder import SUMS
-from service.dataset.posed.of_folder import data_set_of_folder
-from service.dataset.preview.records import CoveragePreview, Preview, ViewPreview, read_preview, write_preview
+from service.dataset.export_folder import SUMS
+from service.dataset.exported import data_set_of_folder
+from service.dataset.exporter import exporter, write_data_set
+from service.dataset.preview_records import CoveragePreview, Preview, ViewPreview, read_preview, write_preview
 from service.run_acts import read_region
 from service.store.events import canonical
 from tests.support.scenes.posed import posed_data_set
@@ -198,7 +198,7 @@ def _region(data: bytes, _: Path) -> None:
     canonical(region.model_dump(mode="json"))
 
 
-_H5 = "service.dataset.posed.of_folder:data_set_of_folder"
+_H5 = "service.dataset.exported:data_set_of_folder"
 _MATCHING = "service.benchmark.matching:open_matching_data"
 TARGETS: tuple[Target, ...] = (
     *(
@@ -223,7 +223,7 @@ TARGETS: tuple[Target, ...] = (
     Target("benchmark_result", "service.benchmark.records:read_results", _result, _results, JSON),
     Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
     Target("own_ply", "service.compute.ground_truth.surface:read_ply", _ply, _plys),
-    Target("preview", "service.dataset.preview.records:read_preview", _preview, _previews, JSON),
-    Target("export_request", "service.audit.export.wanted:kept_request", _request, _requests, JSON),
+    Target("preview", "service.dataset.preview_records:read_preview", _preview, _previews, JSON),
+    Target("export_request", "service.audit.export.exports:kept_request", _request, _requests, JSON),
     Target("region", "service.run_acts:read_region", _region, _regions, JSON),
 )  # fmt: skip

@@ -29,7 +29,7 @@ from service.jobs.records import Mounting
 from service.rig import load_rig
 from service.station import Station
 from service.steps import params_models
-from service.worker.calibration.records import corrected_mounting
+from service.worker.records import corrected_mounting
 
 CAMERA = CameraModel(480, 320, 700.0, 700.0, 239.5, 159.5, -0.05, 0.01)
 MODEL_PARTS = ("cameras", "images", "frames", "points3D", "rigs")

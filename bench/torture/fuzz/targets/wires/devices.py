@@ -22,7 +22,7 @@ from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from bench.torture.fuzz.targets.wires.peers import Listener, threads_watched
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.dashboard import Dashboard
-from service.cli.run.terminal.hands import SimulatedHands
+from service.cli.operators import SimulatedHands
 from service.core.run.noted import HandWork
 from service.store.events import canonical
 from simulators.faults import FaultPlan
@@ -315,5 +315,5 @@ TARGETS: tuple[Target, ...] = (
     Target("fault_plan", "simulators.faults:FaultPlan.parse", _fault_plan, _fault_plans, JSON, **_SIMULATOR),
     Target("ur_facts", "drivers.ur.dashboard:Dashboard", _facts, _dashboard_answers, TEXT, pace=0.5),
     Target("lightbox_answers", "drivers.lightbox:SerialLightbox", _box_driver, _box_answers, _BOTH, pace=0.2),
-    Target("hands_answers", "service.cli.run.terminal.hands:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
+    Target("hands_answers", "service.cli.operators:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
 )

@@ -1,1 +1,0 @@
-"""Background work for pages: work that takes longer than a request may take."""

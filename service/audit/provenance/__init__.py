@@ -1,1 +1,0 @@
-"""Provenance: where every result came from, as a graph and as a drawing."""

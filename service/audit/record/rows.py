@@ -1,0 +1,246 @@
+"""Reads the runs of a data folder and their events in SQL for the auditor's pages, without reading whole runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+from sqlalchemy import Connection, text
+
+from service.core.errors import IntegrityError
+from service.core.records.base import Record
+from service.core.records.events import RunStarted
+from service.store.events import event_sha256, parse_canonical
+from service.store.records import SITE, UnknownRunError
+from service.store.verification.chain_checks import summary
+
+PAGE = 50  # events or artefacts on one page
+LARGEST_SEQ = 2**53
+
+
+@dataclass(frozen=True, slots=True)
+class RunBasics:
+    """What never changes in a run, and the present end of its chain."""
+
+    run_id: str
+    created_utc: str
+    simulated: bool
+    protocol: str  # its id; "" if the first event cannot be read
+    version: str
+    operator: str
+    origin: str  # captured, imported
+    head_seq: int
+    head_sha256: str
+
+
+def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
+    """All runs, newest first; or the run of this name, if there is one."""
+    rows = connection.execute(
+        text(
+            "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, "
+            "json_extract(e.payload, '$.protocol_id') AS protocol, "
+            "json_extract(e.payload, '$.protocol_version') AS version, "
+            "json_extract(e.payload, '$.operator') AS operator, "
+            "json_extract(e.payload, '$.origin') AS origin "
+            "FROM runs AS r LEFT JOIN heads AS h ON h.run_id = r.run_id "
+            "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
+            "WHERE r.run_id <> :site AND (:run IS NULL OR r.run_id = :run) ORDER BY r.created_utc DESC, r.run_id DESC"
+        ),
+        {"site": SITE, "run": None if run_id is None else plain(run_id)},
+    )
+    return [
+        RunBasics(
+            run_id=row.run_id,
+            created_utc=row.created_utc,
+            simulated=bool(row.simulated),
+            protocol=str(row.protocol or ""),
+            version=str(row.version or ""),
+            operator=str(row.operator or ""),
+            origin=str(row.origin or "captured"),
+            head_seq=row.seq or 0,
+            head_sha256=row.sha256 or "",
+        )
+        for row in rows
+    ]
+
+
+def head(connection: Connection, run_id: str) -> tuple[int, str]:
+    """Number and hash of the last event of a run or of the site. Raises UnknownRunError."""
+    row = connection.execute(
+        text("SELECT seq, sha256 FROM heads WHERE run_id = :run"), {"run": plain(run_id)}
+    ).one_or_none()
+    if row is None:
+        raise UnknownRunError(f"there is no run {run_id!r}", remedy="Choose one from the list of runs")
+    return row.seq, row.sha256
+
+
+def plain(value: str) -> str:
+    """The text without lone surrogates, which a request may hold and SQLite refuses."""
+    return value.encode("utf-8", "replace").decode()
+
+
+P = TypeVar("P", bound=Record)
+
+_INLINE_CHARACTERS = 6_000  # of a payload in a list; a longer one is shown on the page of its event
+
+
+def root(connection: Connection, run_id: str) -> RunStarted:
+    """The first event of a run. Raises UnknownRunError, IntegrityError."""
+    event = one_event(connection, run_id, 1)
+    try:
+        return RunStarted.model_validate(event.payload)
+    except ValueError as error:
+        raise IntegrityError("the run's first event is not run_started", where=run_id) from error
+
+
+@dataclass(frozen=True, slots=True)
+class EventRow:
+    """An event as a page shows it."""
+
+    seq: int
+    at_utc: str
+    monotonic_s: float
+    actor: str
+    kind: str
+    step: str
+    attempt: int | None
+    summary: str
+    size: int  # characters of the payload
+    shown: str  # the payload, indented; "" if it is too long for a list
+    payload: Mapping[str, Any]  # complete, or only the short fields of a long payload
+    previous_sha256: str
+    sha256: str
+    artefacts: int
+    job: str = ""  # that it is about
+
+    def record(self, kind: type[P]) -> P | None:
+        """The payload as a record of this kind; None if it is another kind, was altered, or is not complete here."""
+        try:
+            return kind.model_validate(self.payload)
+        except ValidationError:
+            return None
+
+
+_ROW = (
+    "SELECT e.seq, e.at_utc, e.monotonic_s, e.actor, e.kind, e.previous_sha256, e.sha256, length(e.payload) AS size, "
+    "CASE WHEN length(e.payload) <= :inline THEN e.payload WHEN json_valid(e.payload) THEN "
+    "(SELECT json_group_object(j.key, json(json_quote(j.value))) FROM json_each(e.payload) AS j "
+    "WHERE j.type NOT IN ('object', 'array')) END AS payload, "
+    "(SELECT count(*) FROM artefacts AS a WHERE a.run_id = e.run_id AND a.seq = e.seq) AS artefacts "
+    "FROM events AS e WHERE e.run_id = :run AND e.seq IN (SELECT value FROM json_each(:seqs)) ORDER BY e.seq"
+)
+
+
+def read_rows(connection: Connection, run_id: str, seqs: Sequence[int], *, whole: bool = False) -> list[EventRow]:
+    """These events; unless `whole`, long payloads lack their lists and tables."""
+    inline = LARGEST_SEQ if whole else _INLINE_CHARACTERS
+    values = {"run": plain(run_id), "seqs": json.dumps(list(seqs)), "inline": inline}
+    return [_event_row(row, whole=row.size <= inline) for row in connection.execute(text(_ROW), values)]
+
+
+def one_event(connection: Connection, run_id: str, seq: int) -> EventRow:
+    """An event with its whole payload. Raises UnknownRunError."""
+    last, _ = head(connection, run_id)
+    found = read_rows(connection, run_id, [min(max(seq, 0), LARGEST_SEQ)], whole=True)
+    if not found:
+        raise UnknownRunError(f"there is no event {seq}", where=run_id, remedy=f"The run has events 1 to {last}")
+    return found[0]
+
+
+def _event_row(row: Any, *, whole: bool) -> EventRow:
+    try:
+        payload: dict[str, Any] = parse_canonical(row.payload or "null") or {}
+        shown = json.dumps(payload, indent=1, ensure_ascii=False, sort_keys=True) if whole else ""
+        line = headline(payload)
+    except (ValueError, AttributeError):  # altered: shown unchanged
+        payload, shown, line = {}, str(row.payload)[:_INLINE_CHARACTERS], "this payload cannot be read"
+    step, attempt, job = payload.get("step"), payload.get("attempt"), payload.get("job")
+    return EventRow(
+        seq=row.seq,
+        at_utc=row.at_utc,
+        monotonic_s=row.monotonic_s,
+        actor=row.actor,
+        kind=row.kind,
+        step=step if isinstance(step, str) else "",
+        attempt=attempt if isinstance(attempt, int) else None,
+        summary=line,
+        size=row.size,
+        shown=shown,
+        payload=payload,
+        previous_sha256=row.previous_sha256,
+        sha256=row.sha256,
+        artefacts=row.artefacts,
+        job=job if isinstance(job, str) else "",
+    )
+
+
+# fmt: off
+_TELLING = (
+    "viewpoint", "station", "action", "item", "device", "job_kind", "what", "account", "outcome", "field", "measure",
+    "error", "message", "note", "text", "why", "reason", "meaning",
+)
+
+
+def headline(payload: Mapping[str, Any]) -> str:
+    """An event in one line: the most telling fields first, without field names if the value is clear without them."""
+    told = [str(payload[name]) for name in _TELLING if isinstance(payload.get(name), str) and payload[name]]
+    if "passed" in payload:
+        told.append("passed" if payload["passed"] else _not_passed(payload.get("verdicts")))
+    told = [text if len(text) <= 80 else text[:79] + "…" for text in told]
+    rest = {name: value for name, value in payload.items() if name not in ("step", "attempt")}
+    return " · ".join(told) or summary(rest)
+
+
+def _not_passed(verdicts: Any) -> str:
+    short = [v for v in verdicts or () if isinstance(v, Mapping) and not v.get("passed")]
+    return "not decided" if short and all(v.get("undecided") for v in short) else "not passed"
+
+
+def computed_sha256(run_id: str, row: EventRow) -> str:
+    """Hash an event's present content. It differs from the recorded hash if the event was altered."""
+    fields = {
+        "seq": row.seq,
+        "run_id": run_id,
+        "at_utc": row.at_utc,
+        "monotonic_s": row.monotonic_s,
+        "actor": row.actor,
+        "payload": row.payload,
+        "previous_sha256": row.previous_sha256,
+    }
+    return event_sha256(fields)
+
+
+def seq_of_hash(connection: Connection, run_id: str, sha256: str) -> int | None:
+    """The event of the run that has this hash, by the link in its successor or as the last one; or None."""
+    last, end = head(connection, run_id)
+    if sha256 == end:
+        return last
+    found: int | None = connection.execute(
+        text("SELECT seq - 1 FROM events WHERE run_id = :run AND previous_sha256 = :sha256 AND seq > 1"),
+        {"run": plain(run_id), "sha256": plain(sha256)},
+    ).scalar_one_or_none()
+    return found
+
+
+def seqs_of_kind(
+    connection: Connection, run_id: str, kinds: Sequence[str], *, limit: int = 1000, newest: bool = False
+) -> list[int]:
+    """Numbers of the first events of some kinds, or with `newest` of the last ones, in order."""
+    order = "DESC" if newest else "ASC"
+    found = connection.execute(
+        text(
+            "SELECT seq FROM event_index WHERE run_id = :run AND kind IN (SELECT value FROM json_each(:kinds)) "
+            f"ORDER BY +seq {order} LIMIT :limit"  # "+": use the index on the kind, which has few rows
+        ),
+        {"run": plain(run_id), "kinds": json.dumps(list(kinds)), "limit": limit},
+    ).scalars()
+    return sorted(found)
+
+
+def count_of_kind(connection: Connection, run_id: str, kind: str) -> int:
+    """The number of events of a kind."""
+    statement = text("SELECT count(*) FROM event_index WHERE run_id = :run AND kind = :kind")
+    return int(connection.execute(statement, {"run": plain(run_id), "kind": kind}).scalar_one())

@@ -1,0 +1,374 @@
+"""Filters, searches and pages the events and files of a run in SQL; none of it reads a whole run."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from sqlalchemy import Connection, text
+
+from service.audit.record.rows import LARGEST_SEQ, PAGE, EventRow, head, plain, read_rows
+from service.store.records import UnknownRunError
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """Base of filters, whose fields are texts; an empty field matches all."""
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is filtered."""
+        return bool(self.query())
+
+    def query(self) -> dict[str, str]:
+        """The filter as query parameters of a link."""
+        return {name: value for name, value in asdict(self).items() if value}
+
+
+COUNT_LIMIT = 10_000  # matches of a filter beyond this number are not counted
+_SEARCH_CHARACTERS = 200
+_SEARCH_TERMS = 8
+_WORD = re.compile(r"[^\W_]")
+
+
+@dataclass(frozen=True, slots=True)
+class EventFilter(Filter):
+    """A filter for events; an empty field matches all."""
+
+    step: str = ""
+    device: str = ""
+    person: str = ""
+    kind: str = ""
+    q: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EventPage:
+    """A page of events in order, and where the neighbouring pages begin."""
+
+    rows: Sequence[EventRow]
+    before: int | None  # parameter for the page before; None: there is none
+    after: int | None
+    count: int | None  # number of matches; None: more than COUNT_LIMIT
+    missing: int = 0  # events missing from the index, which filters cannot find
+
+
+def search_expression(q: str) -> str | None:
+    """A person's words as an FTS5 expression that matches every word as a prefix; None if there is no word."""
+    words = plain(q)[:_SEARCH_CHARACTERS].replace("\0", " ").replace('"', " ").split()
+    terms = [word for word in words if _WORD.search(word)][:_SEARCH_TERMS]
+    return " AND ".join(f'"{term}"*' for term in terms) or None
+
+
+def events_page(
+    connection: Connection,
+    run_id: str,
+    wanted: EventFilter,
+    *,
+    after: int = 0,
+    before: int = 0,
+    size: int = PAGE,
+    counted: int | None = None,
+) -> EventPage:
+    """The first events after `after`, or with `before` the last ones before it. Raises UnknownRunError.
+
+    Args:
+        counted: the number of matches, if known; otherwise they are counted.
+    """
+    last, _ = head(connection, run_id)
+    after, before = (min(max(value, 0), LARGEST_SEQ) for value in (after, before))
+    backwards = before > 0
+    if not wanted.active:
+        low = max(1, min(before, last + 1) - size) if backwards else after + 1
+        seqs = list(range(low, min(low + size, last + 1, before if backwards else last + 1)))
+        earlier, later = low > 1, bool(seqs) and seqs[-1] < last
+        count: int | None = last
+    else:
+        seqs, more = _matching(connection, run_id, wanted, before if backwards else after, backwards, size)
+        ends = (seqs[0], seqs[-1]) if seqs else (last + 1, 0)
+        earlier = more if backwards else after > 0 and _any(connection, run_id, wanted, ends[0], backwards=True)
+        later = more if not backwards else _any(connection, run_id, wanted, ends[1], backwards=False)
+        count = _count(connection, run_id, wanted) if counted is None else counted
+    rows = read_rows(connection, run_id, seqs)
+    return EventPage(
+        rows=rows,
+        before=(seqs[0] if seqs else last + 1) if earlier else None,
+        after=seqs[-1] if later and seqs else None,
+        count=count,
+        missing=_not_indexed(connection, run_id, last) if wanted.active else 0,
+    )
+
+
+def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[str, dict[str, Any]]:
+    """Conditions on event_index AS i. Reading a range of positions in order is cheaper than using another index."""
+    ends = connection.execute(
+        text(
+            "SELECT (SELECT position FROM event_index WHERE run_id = :run ORDER BY seq LIMIT 1), "
+            "(SELECT position FROM event_index WHERE run_id = :run ORDER BY seq DESC LIMIT 1)"
+        ),
+        {"run": plain(run_id)},
+    ).one()
+    conditions = ["i.position BETWEEN :low AND :high", "+i.run_id = :run"]
+    values: dict[str, Any] = {"run": plain(run_id), "low": ends[0] or 0, "high": ends[1] or -1}
+    for column, value in (("kind", wanted.kind), ("step", wanted.step), ("actor", wanted.person)):
+        if value:
+            conditions.append(f"+i.{column} = :{column}")
+            values[column] = plain(value)
+    if wanted.device:
+        conditions.append(
+            "(i.device = :device OR i.seq IN (SELECT seq FROM artefacts WHERE run_id = :run AND device = :device))"
+        )
+        values["device"] = plain(wanted.device)
+    if wanted.q:
+        match = search_expression(wanted.q)
+        if match is None:
+            conditions.append("0")
+        else:
+            conditions.append(
+                "i.position IN (SELECT rowid FROM event_words "
+                "WHERE event_words MATCH :match AND rowid BETWEEN :low AND :high)"
+            )
+            values["match"] = match
+    return " AND ".join(conditions), values
+
+
+def _matching(
+    connection: Connection, run_id: str, wanted: EventFilter, seq: int, backwards: bool, size: int
+) -> tuple[list[int], bool]:
+    where, values = _where(connection, run_id, wanted)
+    beyond, order = ("<", "DESC") if backwards else (">", "ASC")
+    found = list(
+        connection.execute(
+            text(
+                f"SELECT i.seq FROM event_index AS i WHERE {where} AND +i.seq {beyond} :seq "
+                f"ORDER BY i.position {order} LIMIT :limit"
+            ),
+            values | {"seq": seq, "limit": size + 1},
+        ).scalars()
+    )
+    return sorted(found[:size]), len(found) > size
+
+
+def _any(connection: Connection, run_id: str, wanted: EventFilter, seq: int, *, backwards: bool) -> bool:
+    return bool(_matching(connection, run_id, wanted, seq, backwards, 1)[0])
+
+
+def _count(connection: Connection, run_id: str, wanted: EventFilter) -> int | None:
+    where, values = _where(connection, run_id, wanted)
+    statement = f"SELECT count(*) FROM (SELECT 1 FROM event_index AS i WHERE {where} LIMIT :limit)"
+    count = connection.execute(text(statement), values | {"limit": COUNT_LIMIT + 1}).scalar_one()
+    return count if count <= COUNT_LIMIT else None
+
+
+def _not_indexed(connection: Connection, run_id: str, last: int) -> int:
+    indexed = connection.execute(
+        text("SELECT count(*) FROM event_index WHERE run_id = :run"), {"run": plain(run_id)}
+    ).scalar_one()
+    return last - indexed
+
+
+@dataclass(slots=True)
+class Facets:
+    """The values to filter by, each with its number of events."""
+
+    kinds: dict[str, int] = field(default_factory=dict[str, int])
+    steps: dict[str, int] = field(default_factory=dict[str, int])
+    people: dict[str, int] = field(default_factory=dict[str, int])
+    devices: dict[str, int] = field(default_factory=dict[str, int])
+
+    def matching(self, wanted: EventFilter) -> int | None:
+        """The number of events that match a filter with one condition; None for filters with none or several."""
+        counts = {"kind": self.kinds, "step": self.steps, "person": self.people}
+        fields = wanted.query()
+        if len(fields) != 1 or not counts.keys() & fields.keys():
+            return None
+        ((name, value),) = fields.items()
+        return counts[name].get(value, 0)
+
+    def copy(self) -> Facets:
+        """A copy that can be continued while pages read this one."""
+        return Facets(dict(self.kinds), dict(self.steps), dict(self.people), dict(self.devices))
+
+    def add(self, connection: Connection, run_id: str, after: int, upto: int) -> None:
+        """Count the events of a range."""
+        rows = connection.execute(
+            text(
+                "SELECT kind, step, device, actor, count(*) AS n FROM event_index "
+                "WHERE run_id = :run AND seq > :after AND seq <= :upto GROUP BY 1, 2, 3, 4"
+            ),
+            {"run": plain(run_id), "after": after, "upto": upto},
+        )
+        for row in rows:
+            for counts, name in (
+                (self.kinds, row.kind),
+                (self.steps, row.step),
+                (self.devices, row.device),
+                (self.people, row.actor),
+            ):
+                if name is not None:
+                    counts[name] = counts.get(name, 0) + row.n
+
+
+_LARGEST_PAGE = 10**6
+
+
+@dataclass(frozen=True, slots=True)
+class ArtefactFilter(Filter):
+    """A filter for artefacts; an empty field matches all."""
+
+    kind: str = ""
+    step: str = ""
+    device: str = ""
+    viewpoint: str = ""
+    q: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ArtefactRow:
+    """A recorded artefact."""
+
+    seq: int
+    position: int
+    sha256: str
+    kind: str
+    media_type: str
+    size_bytes: int
+    original_name: str
+    device: str
+    step: str
+    attempt: int | None
+    viewpoint: str
+    who: str
+    at_utc: str
+    monotonic_s: float
+    record_sha256: str
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether a browser can show it."""
+        return self.media_type in ("image/jpeg", "image/png")
+
+
+@dataclass(frozen=True, slots=True)
+class ArtefactPage:
+    """A page of artefacts, and the number of pages and matches."""
+
+    rows: Sequence[ArtefactRow]
+    page: int
+    pages: int
+    count: int
+    size_bytes: int  # number of matches
+
+
+_COLUMNS = (
+    "seq, position, sha256, kind, media_type, size_bytes, original_name, device, step, attempt, viewpoint, who, "
+    "at_utc, monotonic_s, record_sha256"
+)
+
+
+def artefacts_page(
+    connection: Connection, run_id: str, wanted: ArtefactFilter, *, page: int = 1, size: int = PAGE
+) -> ArtefactPage:
+    """One page, in the order of the events; a page number out of range gives the nearest. Raises UnknownRunError."""
+    head(connection, run_id)
+    where, values = _artefact_condition(run_id, wanted)
+    totals = connection.execute(
+        text(f"SELECT count(*) AS n, coalesce(sum(size_bytes), 0) AS size FROM artefacts WHERE {where}"), values
+    ).one()
+    pages = max(1, math.ceil(totals.n / size))
+    page = min(max(page, 1), pages, _LARGEST_PAGE)
+    rows = connection.execute(
+        text(
+            f"SELECT {_COLUMNS} FROM artefacts WHERE {where} ORDER BY run_id, seq, position "
+            "LIMIT :limit OFFSET :offset"
+        ),
+        values | {"limit": size, "offset": (page - 1) * size},
+    )
+    return ArtefactPage([to_row(row) for row in rows], page, pages, totals.n, totals.size)
+
+
+def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[str, Any]]:
+    conditions, values = ["run_id = :run"], {"run": plain(run_id)}
+    for column in ("kind", "step", "device", "viewpoint"):
+        value = getattr(wanted, column)
+        if value:
+            conditions.append(f"{column} = :{column}")
+            values[column] = plain(value)
+    for index, word in enumerate(plain(wanted.q)[:200].replace("\0", " ").split()[:8]):
+        escaped = word.replace("\\", r"\\").replace("%", r"\%").replace("_", r"\_")
+        columns = ("original_name", "viewpoint", "sha256", "kind", "step", "who")
+        conditions.append("(" + " OR ".join(f"{c} LIKE :word{index} ESCAPE '\\'" for c in columns) + ")")
+        values[f"word{index}"] = f"%{escaped}%"
+    return " AND ".join(conditions), values
+
+
+def to_row(row: Any) -> ArtefactRow:
+    """A row of the table `artefacts` as an ArtefactRow."""
+    return ArtefactRow(
+        seq=row.seq,
+        position=row.position,
+        sha256=row.sha256,
+        kind=row.kind,
+        media_type=row.media_type,
+        size_bytes=row.size_bytes,
+        original_name=row.original_name,
+        device=row.device,
+        step=row.step or "",
+        attempt=row.attempt,
+        viewpoint=row.viewpoint or "",
+        who=row.who,
+        at_utc=row.at_utc,
+        monotonic_s=row.monotonic_s,
+        record_sha256=row.record_sha256,
+    )
+
+
+def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]) -> list[ArtefactRow]:
+    """The artefacts that these events brought."""
+    if not seqs:
+        return []
+    rows = connection.execute(
+        text(
+            f"SELECT {_COLUMNS} FROM artefacts WHERE run_id = :run AND seq IN (SELECT value FROM json_each(:seqs)) "
+            "ORDER BY seq, position LIMIT 1000"
+        ),
+        {"run": plain(run_id), "seqs": str(list(seqs))},
+    )
+    return [to_row(row) for row in rows]
+
+
+def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[ArtefactRow]:
+    """Every record of a file in this run; the first says where it came from. Raises UnknownRunError."""
+    head(connection, run_id)
+    rows = connection.execute(
+        text(
+            f"SELECT {_COLUMNS} FROM artefacts WHERE sha256 = :sha256 AND run_id = :run "
+            "ORDER BY seq, position LIMIT 100"
+        ),
+        {"run": plain(run_id), "sha256": plain(sha256)},
+    )
+    found = [to_row(row) for row in rows]
+    if not found:
+        raise UnknownRunError(
+            "the run has no artefact of this SHA-256",
+            where=plain(sha256)[:80],
+            remedy="Search for it among the artefacts",
+        )
+    return found
+
+
+def artefact_facets(connection: Connection, run_id: str) -> dict[str, dict[str, int]]:
+    """The values to filter by, each with its number of artefacts."""
+    rows = connection.execute(
+        text("SELECT kind, step, device, count(*) AS n FROM artefacts WHERE run_id = :run GROUP BY 1, 2, 3"),
+        {"run": plain(run_id)},
+    )
+    counts: dict[str, dict[str, int]] = {"kind": {}, "step": {}, "device": {}}
+    for row in rows:
+        for name, value in (("kind", row.kind), ("step", row.step), ("device", row.device)):
+            if value:
+                counts[name][value] = counts[name].get(value, 0) + row.n
+    return counts

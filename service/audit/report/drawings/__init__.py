@@ -1,1 +1,0 @@
-"""Drawings and pictures of a report."""

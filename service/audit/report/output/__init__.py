@@ -1,1 +1,0 @@
-"""A report written as HTML, PDF, SVG and CSV."""

@@ -1,0 +1,178 @@
+"""`orthocapture benchmark`: compare methods of reconstruction and of matching on an exported data set."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_document,
+    print_json,
+    print_table,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    require_writable_folder,
+    write_whole,
+)
+from service.core.units import metres
+
+DEFAULT_OUT = Path("benchmark")
+
+
+class _Scenario(StrEnum):
+    DENSE = "dense"
+    SPARSE = "sparse"
+
+
+def run_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder written by `orthocapture export --format hdf5`.")],
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method",
+            metavar="NAME",
+            help="stereo, colmap, pycolmap, openmvs, instant-ngp, neus2, sugar, gsplat, or that of a plug-in.",
+        ),
+    ],
+    scenario: Annotated[_Scenario, typer.Option("--scenario", help="All images, or the split of a few.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the results.")] = DEFAULT_OUT,
+    mesh: Annotated[
+        Path | None, typer.Option("--mesh", help="Score this mesh of the method, which was made elsewhere.")
+    ] = None,
+    width: Annotated[
+        int, typer.Option(min=0, metavar="PX", help="Width of the images; 0: that of the data set.")
+    ] = 0,
+    spacing_mm: Annotated[
+        float, typer.Option("--spacing-mm", min=0.01, help="Spacing to which both meshes are sampled.")
+    ] = 0.1,
+    json: JsonOption = False,
+) -> None:
+    """Reconstruct the specimen with a method, and compare its mesh with the ground truth.
+
+    The method gets images, poses and the extent of the scene in the format that it reads. Its mesh is brought back
+    into the frame of the data set, cut to the box of the ground truth, and scored as `evaluate chamfer` does. If the
+    method is not installed, the command says what is expected; run it elsewhere and give its mesh with --mesh.
+    """
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        # These load the numerics, which take seconds.
+        from service.benchmark.methods import method_named  # noqa: PLC0415
+        from service.benchmark.running import Trial, run_trial  # noqa: PLC0415
+        from service.compute.ground_truth.chamfer import ChamferSettings  # noqa: PLC0415
+        from service.dataset.exported import data_set_of_folder  # noqa: PLC0415
+
+        how = method_named(method)
+        require_writable_folder(out)
+        progress("reading the data set", 0, 0)
+        whole = data_set_of_folder(dataset)
+        trial = Trial(how, scenario.value, out, mesh, width, ChamferSettings(metres(spacing_mm)))
+        result = run_trial(trial, whole, progress)
+    if json:
+        print_json(result.model_dump(mode="json"))
+    elif result.score is None:
+        console.print(f"{how.words}, {scenario.value}: no mesh. {result.failure}")
+    else:
+        score = result.score
+        console.tell(
+            f"{how.words}, {scenario.value}, {result.views} images: ",
+            (f"Chamfer distance {score.chamfer_mm:.3f} mm", "bold"),
+            f" (accuracy {score.accuracy_mm:.3f} mm, "
+            f"completeness {score.completeness_mm:.3f} mm; equal surfaces would give {score.floor_mm:.3f} mm)",
+        )
+        console.print(f"  written: {trial.folder!s}")
+
+
+def table_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the results.")] = DEFAULT_OUT,
+    markdown: Annotated[Path | None, typer.Option("--markdown", help="Write the table to this file too.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", help="Write the meshes with their heat maps, side by side, as PNG.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Print the table of the benchmark, as in the paper: dense and sparse, with times, memory and command lines.
+
+    A method without a result is listed with what it expects and the commands that it would run.
+    """
+    with reporting_errors(json):
+        # These load the numerics, which take seconds.
+        from service.benchmark.methods import methods  # noqa: PLC0415
+        from service.benchmark.records import read_results  # noqa: PLC0415
+        from service.benchmark.table import (  # noqa: PLC0415
+            figure_png,
+            table_markdown,
+            table_record,
+        )
+
+        results, known = read_results(out), methods()
+        text = table_markdown(results, known)
+        if markdown is not None:
+            require_writable(markdown)
+            write_whole(markdown, text)
+        if figure is not None:
+            require_writable(figure)
+            write_whole(figure, figure_png(out, results, known))
+        if json:
+            print_json(table_record(results, known))
+        else:
+            print_document(f"{text}\n")
+
+
+def matching_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder that `export --format matching` wrote.")],
+    method: Annotated[str, typer.Option(metavar="NAME", help="sift, loftr, lightglue, or that of a plug-in.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the result; several methods may share one.")
+    ],
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The weights of a learned method; nothing is downloaded.")
+    ] = None,
+    pairs_per_class: Annotated[
+        int, typer.Option("--pairs-per-class", min=0, help="Pairs of each difficulty at most; 0: all.")
+    ] = 50,
+    json: JsonOption = False,
+) -> None:
+    """Score a method of feature matching on image pairs: pose error, precision and epipolar error by difficulty.
+
+    The method is given two images and nothing else. Poses, depth and occlusion only judge its matches. The folder
+    gets METHOD.json, pictures of matches, and table.md and curves.png of all methods in it.
+    """
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        # These load the numerics, which take seconds.
+        from service.benchmark.matching import MatchingTask, run_matching  # noqa: PLC0415
+        from service.benchmark.matching_results import (  # noqa: PLC0415
+            HEADER,
+            record,
+            rows,
+        )
+        from service.compute.matching.methods.method import matcher  # noqa: PLC0415
+
+        how = matcher(method)
+        require_writable_folder(out)
+        out.mkdir(exist_ok=True)
+        results = run_matching(MatchingTask(dataset, how, weights, pairs_per_class, out), progress)
+        if json:
+            own = next(result for result in results if result.method == how.name)
+            print_json(record(own))
+            return
+    table = Table(*HEADER)
+    for row in rows(results):
+        table.add_row(*row)
+    print_table(table)
+    console.print(f"Written to {out!s}: {how.name}.json, table.md, curves.png")
+    if any(result.simulated for result in results):
+        console.print("  The data set is simulated.")
+
+
+benchmark_app = typer.Typer(
+    help="Compare methods on an exported data set.", no_args_is_help=True, pretty_exceptions_enable=False
+)
+benchmark_app.command("run")(run_command)
+benchmark_app.command("table")(table_command)
+benchmark_app.command("matching")(matching_command)

@@ -1,1 +1,0 @@
-"""`orthocapture benchmark`: methods compared on an exported data set."""

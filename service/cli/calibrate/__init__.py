@@ -1,1 +1,0 @@
-"""`orthocapture calibrate`: intrinsics and hand-eye calibration from images of a board."""

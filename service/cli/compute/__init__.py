@@ -1,1 +1,0 @@
-"""Commands that compute from files, without a run."""

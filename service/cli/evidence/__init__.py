@@ -1,1 +1,0 @@
-"""Commands that read, verify, replay, report and back up the record."""

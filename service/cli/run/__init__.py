@@ -1,1 +1,0 @@
-"""Commands that start and drive runs."""

@@ -1,1 +1,0 @@
-"""Commands of a site: its rig, pages, workers, protocols and plans."""

@@ -1,0 +1,253 @@
+"""`orthocapture store`: maintain the folder that holds the evidence: back up, restore, rebuild, remove leftovers."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable_folder,
+)
+from service.cli.options import OperatorOption, PasswordOption, acting_person
+from service.core.text.words import counted
+from service.core.units import gigabytes
+from service.store.backup.backup import BackupOptions, BackupReport, back_up
+from service.store.backup.restore import RestoreReport, restore
+from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
+from service.store.journal.rebuild import RebuildReport, rebuild
+from service.store.records import SITE
+from service.store.signatures.signing import checkpoint
+from service.store.store import Store
+
+
+def backup_command(
+    destination: Annotated[
+        Path, typer.Argument(metavar="BACKUP", help="Folder of backups: new, empty, or with earlier backups.")
+    ],
+    data: DataOption = DEFAULT_DATA,
+    with_keys: Annotated[
+        bool, typer.Option("--with-keys", help="Copy the private signing key too; anybody who reads it can sign.")
+    ] = False,
+    read_all: Annotated[
+        bool, typer.Option("--read-all", help="Read all files of earlier backups again, and repair damaged ones.")
+    ] = False,
+    keep: Annotated[int | None, typer.Option("--keep", help="Keep this many states; default: all.", min=1)] = None,
+    json: JsonOption = False,
+) -> None:
+    """Back up the data folder, also during a run; after the first time only new files are copied.
+
+    After an interruption, repeat the command and it will continue. The exit status is 1 if no backup was made, or if
+    the copied data does not verify.
+    """
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        require_writable_folder(destination)
+        made = back_up(data, destination, BackupOptions(with_keys, read_all, keep), progress=progress)
+    if json:
+        print_json(_backup_json(made))
+    else:
+        _print_backup(made)
+    if made.state.faults:
+        raise typer.Exit(1)
+
+
+def restore_command(
+    backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="The folder of backups.")],
+    destination: Annotated[Path, typer.Argument(metavar="DIR", help="The new data folder: empty or not existing.")],
+    state: Annotated[str, typer.Option("--state", help="The backup to restore; default: the newest.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Restore a data folder as it was when the backup was made, and verify it.
+
+    The name of an account in the backup needs the password that it had then. The exit status is 1 if anything is
+    missing or does not verify.
+    """
+
+    def actor(folder: Path) -> str:
+        with Store.open(folder, create=False) as store:
+            return acting_person(store, operator, password_stdin=password_stdin).name
+
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        require_writable_folder(destination)
+        made = restore(backup, destination, name=state, actor=actor, progress=progress)
+    if json:
+        print_json(_restore_json(made))
+    else:
+        _print_restore(made)
+    if not made.ok:
+        raise typer.Exit(1)
+
+
+def _backup_json(made: BackupReport) -> dict[str, Any]:
+    return {
+        "ok": not made.state.faults,
+        "folder": str(made.folder),
+        "name": made.name,
+        "copied": made.copied,
+        "copied_bytes": made.copied_bytes,
+        "present": made.present,
+        "state": made.state.model_dump(mode="json"),
+    }
+
+
+def _restore_json(made: RestoreReport) -> dict[str, Any]:
+    return {
+        "ok": made.ok,
+        "folder": str(made.folder),
+        "name": made.name,
+        "lost": list(made.lost),
+        "faults": [str(fault) for fault in made.audit.faults],
+        "state": made.state.model_dump(mode="json"),
+    }
+
+
+def _print_backup(made: BackupReport) -> None:
+    state = made.state
+    console.print(
+        f"Backup {made.name} is in {made.folder!s}: {counted(len(state.heads), 'chain')}, "
+        f"{counted(state.artefacts, 'file')}, {gigabytes(state.artefact_bytes):.2f} GB."
+    )
+    console.print(
+        f"  Copied this time and read again: {counted(made.copied, 'file')}, {gigabytes(made.copied_bytes):.2f} GB; "
+        f"{made.present} were there."
+    )
+    if not state.with_keys:
+        console.print(
+            "  It does not hold the signing key: keep the folder keys/ elsewhere (see docs/howto/operating.md)."
+        )
+    if state.faults:
+        console.tell(("What was copied does not verify.", "bold red"), f" First fault: {state.faults[0]}")
+        console.print("  Older backups are kept. Run: orthocapture audit verify all")
+
+
+def _print_restore(made: RestoreReport) -> None:
+    state = made.state
+    console.print(f"{made.folder!s} is as {state.data_folder} was at {state.at_utc}.")
+    if not state.with_keys:
+        console.print(
+            "  The signing key was not in the backup: restore the folder keys/, or declare the key lost with"
+        )
+        console.print("  orthocapture audit rotate-key --lost --reason ...")
+    for line in made.lost:
+        console.tell("  ", (line, "red"))
+    if made.ok:
+        console.tell(("Verified:", "bold green"), " everything is as it was recorded.")
+    elif made.audit.first_fault is not None:
+        console.tell(("NOT verified.", "bold red"), f" First fault: {made.audit.first_fault}")
+        if state.faults:
+            console.print(f"  The data folder had a fault when it was copied: {state.faults[0]}")
+
+
+def rebuild_command(
+    data: DataOption = DEFAULT_DATA,
+    journal: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A copy of the journal kept elsewhere, to make the database from it.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Restore a database that was overwritten, cut or lost from its journal; or the journal from the database.
+
+    Stop every process of the data folder first. The old files are kept beside the new ones, and the record says what
+    was done. The exit status is 1 if anything could not be restored.
+    """
+
+    def actor(folder: Path) -> str:
+        with Store.open(folder, create=False) as store:
+            return acting_person(store, operator, password_stdin=password_stdin).name
+
+    with reporting_errors(json):
+        made = rebuild(data, actor=actor, journal=journal)
+    if json:
+        print_json(asdict(made))
+    else:
+        _print(made)
+    if made.lost:
+        raise typer.Exit(1)
+
+
+def _print(made: RebuildReport) -> None:
+    if not made.made:
+        console.print("Database and journal agree: there is nothing to rebuild.")
+        return
+    console.print(f"Found: {made.why}.")
+    console.print(
+        f"The {made.made} was made again: {counted(made.events, 'event')}, {made.restored_events} of them restored."
+    )
+    for name in made.kept:
+        console.print(f"  kept: {name}")
+    for line in made.lost:
+        console.tell("  ", ("not restored:", "red"), f" {line}")
+    if made.unsigned:
+        console.tell("  ", ("The record of this is not signed:", "yellow"), f" {made.unsigned}")
+    console.print("  Run: orthocapture audit verify all")
+
+
+store_app = typer.Typer(name="store", help="Maintain the folder that holds the evidence.", no_args_is_help=True)
+
+
+@store_app.callback()
+def store() -> None:
+    """Maintain the folder that holds the evidence."""
+
+
+store_app.command("backup")(backup_command)
+store_app.command("restore")(restore_command)
+store_app.command("rebuild")(rebuild_command)
+
+
+@store_app.command("gc")
+def gc_command(
+    data: DataOption = DEFAULT_DATA,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the files instead of listing them.")] = False,
+    min_age_min: Annotated[
+        float, typer.Option("--min-age-min", min=0, help="Keep files younger than this many minutes.")
+    ] = USUAL_AGE_S / 60,
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    json: JsonOption = False,
+) -> None:
+    """List files left by crashes, to which no record refers. With --remove, remove them and record the removal.
+
+    Recorded files are never touched, nor are files that a running process may still record.
+    """
+    with reporting_errors(json), Store.open(data, create=False) as opened:
+        age_s = 60 * min_age_min
+        gone = []
+        if remove:
+            who = acting_person(opened, operator, password_stdin=password_stdin)
+            gone = remove_leftovers(opened, actor=who.name, min_age_s=age_s)
+            if gone:
+                checkpoint(opened, SITE)
+        left = leftovers(opened, min_age_s=age_s)
+    if json:
+        print_json({"removed": [asdict(one) for one in gone], "left": [asdict(one) for one in left]})
+        return
+    for one in gone:
+        console.print(f"removed: {one.path} ({one.size_bytes} bytes, written {one.written_utc})")
+    for one in left:
+        why = f"stays: {one.stays}" if one.stays else "may be removed"
+        console.print(f"{one.path} ({one.size_bytes} bytes, written {one.written_utc}): {why}")
+    removable = sum(not one.stays for one in left)
+    if not gone and not left:
+        console.print("Nothing is left over: a record refers to every file.")
+    elif removable:
+        console.print(f"{removable} of these can be removed: add --remove. No record refers to them.")

@@ -1,0 +1,232 @@
+"""Writes croissant.json, MLCommons Croissant 1.0 metadata of views, pictures and masks, and the table views.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.core.records.data_set import Party
+from service.dataset.crate import media_type
+from service.dataset.export_folder import ListedFile
+from service.dataset.records import DataSet, PosedView
+
+_TERMS = (
+    "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field", "fileObject", "fileProperty",
+    "fileSet", "format", "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet",
+    "references", "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField", "transform",
+)  # fmt: skip
+
+CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "dct": "http://purl.org/dc/terms/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    **{term: f"cr:{term}" for term in _TERMS},
+}
+
+
+VIEWS_NAME = "views.csv"
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+COVARIANCE = tuple(f"c{row}{column}" for row in range(6) for column in range(row, 6))
+_UPPER = np.triu_indices(6)
+Parts = Mapping[str, Mapping[str, str]]  # role → view → file
+
+
+def view_columns(parts: Parts) -> dict[str, str]:
+    """The columns in order, each with what it holds."""
+    return {
+        "name": "name of the view",
+        **{role: f"{role} of the view, a file of this folder" for role in parts},
+        "split": "train or test",
+        "sparse": "whether the view is one of the sparse split",
+        "simulated": "whether the view was made by a simulated rig",
+        "camera": "name of the further camera that took it; empty: the first camera",
+        "width": "of the picture, px",
+        "height": "of the picture, px",
+        "fx": "focal length along x, px",
+        "fy": "focal length along y, px",
+        "cx": "principal point, px; the centre of the first pixel is 0",
+        "cy": "principal point, px; the centre of the first pixel is 0",
+        **dict.fromkeys(CAMERA[6:], "distortion, as OpenCV defines it"),
+        **dict.fromkeys(POSE[:3], "position of the camera in the world, m"),
+        **dict.fromkeys(POSE[3:], "rotation from the camera (x right, y down, z forward) to the world"),
+        **dict.fromkeys(COVARIANCE, "covariance of the pose: position (m), rotation (rad), axes of the world"),
+    }
+
+
+def views_csv(dataset: DataSet, parts: Parts) -> bytes:
+    """The table; `parts` names the files of each view, relative to the folder."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(view_columns(parts))
+    test, sparse = set(dataset.splits.test), set(dataset.splits.sparse)
+    for view in dataset.views:
+        files = [files.get(view.name, "") for files in parts.values()]
+        split = "test" if view.name in test else "train"
+        about = [split, _flag(view.name in sparse), _flag(dataset.simulated), view.device]
+        writer.writerow([view.name, *files, *about, *_numbers(view)])
+    return text.getvalue().encode()
+
+
+def _flag(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _numbers(view: PosedView) -> Sequence[str]:
+    camera, T = view.camera, view.T_world_camera
+    lens = [getattr(camera, name) for name in CAMERA]
+    pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+    shown = [str(int(value)) for value in lens[:2]]
+    return [*shown, *(repr(float(value)) for value in (*lens[2:], *pose, *view.covariance[_UPPER]))]
+
+
+NAME = "croissant.json"
+_PICTURES = ("image/jpeg", "image/png")
+#: Croissant's readers turn images into 8 bits of red, green and blue, which a depth of 16 bits does not survive.
+_NOT_AS_PICTURES = ("depth", "arrays")
+_TYPES = {
+    **dict.fromkeys(("sparse", "simulated"), "sc:Boolean"),
+    **dict.fromkeys(CAMERA[:2], "sc:Integer"),
+    **dict.fromkeys((*CAMERA[2:], *POSE, *COVARIANCE), "sc:Float"),
+}
+
+
+def croissant(
+    dataset: DataSet, words: str, files: Sequence[ListedFile], parts: Parts, described: Mapping[str, str]
+) -> dict[str, Any]:
+    """The metadata as plain data.
+
+    Args:
+        dataset: as it is written.
+        words: the format in a few words.
+        files: of the folder, without this one.
+        parts: the files of the views: role → view → file.
+        described: what a file is, by its name.
+    """
+    about = dataset.about
+    marked = "SIMULATED " if dataset.simulated else ""
+    of_views = {file for named in parts.values() for file in named.values()}
+    return {
+        "@context": CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": f"{marked}{about.title}",
+        "description": (
+            f"{marked}Posed images and a surface mesh in one frame. Format: {words}. Ethics: {about.ethics}."
+            + (f" {dataset.mark}." if dataset.simulated else "")
+        ),
+        "version": about.version,
+        "datePublished": about.published_utc[:10] or "1970-01-01",
+        "license": about.licence_address or about.licence,
+        "citeAs": about.citation,
+        "url": about.doi or f"urn:orthocapture:run:{about.run or 'unknown'}",
+        "creator": [_party(maker) for maker in about.creators or (Party("not stated", "Organization"),)],
+        **({} if about.publisher is None else {"publisher": _party(about.publisher)}),
+        **({"funder": [_party(funder) for funder in about.funders]} if about.funders else {}),
+        **({"identifier": about.doi} if about.doi else {}),
+        "keywords": ["simulated"] if dataset.simulated else ["captured"],
+        "distribution": [
+            *(_file_object(file, described) for file in files if file.path not in of_views),
+            *(_file_set(role, named.values()) for role, named in parts.items()),
+        ],
+        "recordSet": [
+            _views(parts),
+            *(_pictures(role) for role, named in parts.items() if _is_pictures(role, named.values())),
+        ],
+    }
+
+
+def _party(one: Party) -> dict[str, str]:
+    return {"@type": f"sc:{one.kind}", "name": one.name, **({"url": one.address} if one.address else {})}
+
+
+def _file_object(file: ListedFile, described: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        "@type": "cr:FileObject",
+        "@id": file.path,
+        "name": file.path,
+        "description": described.get(file.path, ""),
+        "contentUrl": file.path,
+        "contentSize": f"{file.size_bytes} B",
+        "encodingFormat": media_type(file.path),
+        "sha256": file.sha256,
+    }
+
+
+def _file_set(role: str, files: Iterable[str]) -> dict[str, Any]:
+    """The files of one role, which lie in folders of their own."""
+    paths = [PurePosixPath(file) for file in files]
+    return {
+        "@type": "cr:FileSet",
+        "@id": role,
+        "name": role,
+        "description": f"The {role} of each view; SHA256SUMS has their hashes",
+        "encodingFormat": sorted({media_type(path.name) for path in paths}),
+        "includes": sorted({f"{path.parent}/*{path.suffix}" for path in paths}),
+    }
+
+
+def _views(parts: Parts) -> dict[str, Any]:
+    """One record for each view, from views.csv."""
+    columns = view_columns(parts)
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "views",
+        "name": "views",
+        "description": "Each view with its files, its camera and its pose",
+        "key": {"@id": "views/name"},
+        "field": [
+            {
+                "@type": "cr:Field",
+                "@id": f"views/{name}",
+                "name": name,
+                "description": meaning,
+                "dataType": _TYPES.get(name, "sc:Text"),
+                "source": {"fileObject": {"@id": VIEWS_NAME}, "extract": {"column": name}},
+            }
+            for name, meaning in columns.items()
+        ],
+    }
+
+
+def _is_pictures(role: str, files: Iterable[str]) -> bool:
+    return role not in _NOT_AS_PICTURES and all(media_type(file) in _PICTURES for file in files)
+
+
+def _pictures(role: str) -> dict[str, Any]:
+    """One record for each picture of a role: its file, as views.csv names it, and its pixels."""
+    name = f"{role}_pixels"
+    fields = {
+        "file": ("sc:Text", "fullpath", f"the file, as the field {role} of the views names it"),
+        "pixels": ("sc:ImageObject", "content", "the pixels"),
+    }
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": f"The {role} of each view as pixels",
+        "field": [
+            {
+                "@type": "cr:Field",
+                "@id": f"{name}/{field}",
+                "name": field,
+                "description": meaning,
+                "dataType": kind,
+                "source": {"fileSet": {"@id": role}, "extract": {"fileProperty": what}},
+            }
+            for field, (kind, what, meaning) in fields.items()
+        ],
+    }

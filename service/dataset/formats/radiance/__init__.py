@@ -1,1 +1,0 @@
-"""Formats of radiance fields and neural surfaces."""

@@ -1,1 +1,0 @@
-"""What every exported folder has besides its format: an index of the views, a data card, Croissant and RO-Crate."""

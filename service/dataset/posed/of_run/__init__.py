@@ -1,1 +1,0 @@
-"""The posed data set of a finished run, as its record states it."""

@@ -1,1 +1,0 @@
-"""Pictures and figures of a data set for the screen, made once in the background; never evidence, never exported."""

@@ -1,1 +1,0 @@
-"""Kinds of jobs on images of the calibration board."""

@@ -1,1 +1,0 @@
-"""Kinds of jobs while images are being taken."""

@@ -1,0 +1,80 @@
+"""Job kind `develop`: a raw file, developed with fixed parameters to a linear TIFF that matches its JPEG."""
+
+from __future__ import annotations
+
+from service.jobs.kind import Demand, JobKind, JobRecord
+from service.jobs.records import Hash
+
+
+class Parameters(JobRecord):
+    """How the file is developed; the fields of DevelopParameters (service/compute/images/develop_parameters.py)."""
+
+    demosaic: str
+    white_balance: str
+    primaries: str
+    gamma: tuple[float, float]
+    highlights: str
+    auto_brightness: bool
+    noise_reduction: bool
+    orientation: int
+    bits: int
+
+
+class Arguments(JobRecord):
+    """The raw file and the JPEG of one exposure, and how the raw file is developed."""
+
+    viewpoint: str
+    raw: Hash
+    jpeg: Hash
+    parameters: Parameters
+
+
+class Crop(JobRecord):
+    """The JPEG's part of the developed area, in pixels, and where it comes from: `file`, `moved` or `matched`."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    found: str
+
+
+class Answer(JobRecord):
+    """What was developed, and how.
+
+    Attributes:
+        raw: SHA-256 of the raw file.
+        parameters: as asked for.
+        white_balance: gains that the camera recorded, of red, green, blue and second green.
+        black_level: of the four photosites of the pattern.
+        white_level: of the sensor's values.
+        area: width and height of the exposed area, px.
+        crop: of the picture in it.
+        shift_px: median shift of the picture against the JPEG, in x and y.
+        largest_shift_px: of a part of the picture.
+        rawpy: its version.
+        libraw: its version.
+    """
+
+    raw: Hash
+    parameters: Parameters
+    white_balance: tuple[float, ...]
+    black_level: tuple[int, ...]
+    white_level: int
+    area: tuple[int, int]
+    crop: Crop
+    shift_px: tuple[float, float]
+    largest_shift_px: float
+    rawpy: str
+    libraw: str
+
+
+KIND = JobKind(
+    name="develop",
+    arguments=Arguments,
+    answer=Answer,
+    compute="service.worker.outlines:develop_raw",
+    words="developed raw files",
+    order=58,
+    demand=lambda _: Demand(memory_mb=2700, limit_s=1800),
+)

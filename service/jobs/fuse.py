@@ -1,0 +1,95 @@
+"""Job kind `fuse`: the ground-truth mesh, from the CT and the scan, with the checks that both are in one frame."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from service.jobs.kind import Demand, JobKind, JobRecord
+from service.jobs.records import Hash, Matrix, Point, SpheresFound
+from service.jobs.register import Registration
+
+Frame = Literal["world", "scan", "ct"]
+
+
+class Region(JobRecord):
+    """A part of space in which a person says which source counts: a polygon, or a box along the axes.
+
+    Attributes:
+        source: that counts there.
+        frame: of the positions.
+        by: who drew it.
+        corners_m: (K, 3) of a polygon, in order; empty for a box.
+        along: from the surface towards the viewer of the polygon; None: away from the table.
+        below_m, above_m: how far the polygon reaches beyond its lowest and highest corner.
+        centre_m, size_m: of a box.
+    """
+
+    source: Literal["ct", "scan"]
+    frame: Frame
+    by: str
+    corners_m: tuple[Point, ...] = ()
+    along: Point | None = None
+    below_m: float = 0.0
+    above_m: float = 0.0
+    centre_m: Point | None = None
+    size_m: Point | None = None
+
+
+class Arguments(JobRecord):
+    """Both meshes with their spheres, and the image-based registration of each, if there are images.
+
+    Attributes:
+        ct_mesh, scan_mesh: vertices and faces, in the frame of each.
+        ct, scan: the spheres in them.
+        ct_registration, scan_registration: with the same camera poses.
+        blend_m: width of the overlap over which the sources change.
+        spacing_m: of the samples for the Chamfer distance.
+        post_radius_m: of the spheres' posts, which are then cut out with the spheres; None: nothing is cut out.
+        regions: where people decided, the later overruling the earlier.
+        simulated: the run is, and the meshes say so; jobs of earlier versions did not say it.
+    """
+
+    ct_mesh: Hash
+    scan_mesh: Hash
+    ct: SpheresFound
+    scan: SpheresFound
+    ct_registration: Registration | None = None
+    scan_registration: Registration | None = None
+    radius_m: float
+    blend_m: float
+    spacing_m: float
+    post_radius_m: float | None = None
+    regions: tuple[Region, ...] = ()
+    simulated: bool = False
+
+
+class Answer(JobRecord):
+    """How the ground truth was made.
+
+    Attributes:
+        T_scan_ct: from sphere to sphere; the CT was moved by it.
+        covariance: (6, 6) of it, m and rad.
+        T_scan_ct_by_images: through the cameras; None without images.
+        wound_m: (K, 3) outline of the wound's region in the scan's frame; empty without a wound.
+        regions: that people drew and that were used.
+        taken_away: spheres, by their numbers in the CT, that were cut out because the scan lacks them.
+    """
+
+    T_scan_ct: Matrix
+    covariance: Matrix
+    T_scan_ct_by_images: Matrix | None = None
+    wound_m: tuple[Point, ...] = ()
+    regions: tuple[Region, ...] = ()
+    taken_away: tuple[int, ...] = ()
+
+
+KIND = JobKind(
+    name="fuse",
+    arguments=Arguments,
+    answer=Answer,
+    compute="service.worker.fuse:fuse",
+    words="ground-truth mesh",
+    version=4,  # leaves no face turned over; compares two million samples of a larger surface, not all
+    order=65,
+    demand=lambda _: Demand(memory_mb=1500, limit_s=7200),
+)

@@ -1,1 +1,0 @@
-"""Kinds of jobs that estimate camera poses from images."""

@@ -1,0 +1,135 @@
+"""Job kind `register`: T_world_scan for one source of camera poses."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from service.jobs import further_camera
+from service.jobs.detect_spheres import SceneArguments
+from service.jobs.kind import Demand, JobKind, JobRecord
+from service.jobs.records import Camera, Hash, Matrix
+
+ARM = ("robot", "robot_corrected")  # sources of poses that are an arm's
+POSE_ERRORS = "pose_errors"  # kind of the artefact with the errors of the poses
+
+
+class Arguments(SceneArguments):
+    """Outlines and the source of the poses, with its model if they come from the images.
+
+    With `state_pose_errors`, which is for poses of an arm and of the spheres, the errors of the poses are estimated
+    and kept. Poses of the spheres then follow from the outlines alone, and images that show fewer than four spheres
+    have none.
+    """
+
+    outlines: Hash
+    poses: str
+    model: Hash | None = None
+    tracks: Hash | None = None
+    state_pose_errors: bool = False  # jobs of earlier versions did not
+
+
+class LeaveOneOut(JobRecord):
+    """The mean errors of spheres predicted from the others; of each, radial (mm), reprojection (px), and images."""
+
+    mean_radial_error_mm: float
+    mean_reprojection_error_px: float
+    spheres: dict[str, tuple[float | int, ...]]
+
+
+class Contradiction(JobRecord):
+    """A contradiction between the inputs, in words, and what to do; `refuses`: before the result is used."""
+
+    kind: str
+    what: str
+    remedy: str
+    refuses: bool = False
+
+    @property
+    def text(self) -> str:
+        """Both parts, as a line of a report."""
+        return f"{self.what}. {self.remedy}"
+
+
+class CommonError(JobRecord):
+    """An error that all outlines share, as they have it: in px, or for `focal_x` and `focal_y` relative.
+
+    Attributes:
+        name: of the error.
+        value: as a fit that leaves it free has it.
+        sigma: of the value.
+        expected: standard deviation by which it may differ from zero.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    expected: float
+
+
+class Registration(JobRecord):
+    """A registration.
+
+    Attributes:
+        poses: the source of the camera poses.
+        camera: with which the outlines were detected.
+        outlines: file with the outlines.
+        full_camera: at the size of the photographs, if the images were reduced.
+        T_world_scan: world is the base of the first station, or the reconstruction's own frame.
+        scale: of the reconstruction; 1 for metric poses.
+        rms_px: of the outlines that were used.
+        T_world_station: by station.
+        T_scan_camera: by viewpoint.
+        T_scan_camera_given: of corrected poses of the arm, before the outlines refined them.
+        covariance_given: (6, 6) of T_world_scan with these; both are set for corrected poses of the arm only.
+        excluded: outlines left out as outliers, in words.
+        covariance: (6, 6) of T_world_scan, m and rad.
+        components: terms whose sum is the covariance.
+        leave_one_out: None if a station sees too few spheres for it.
+        pose_sigma_m: of a single pose of the arm, along each axis, before the outlines refined it; None: not stated.
+        pose_sigma_rad: of its rotation vector.
+        findings: contradictions between the inputs; empty in jobs of earlier versions, as the next three.
+        left_out: images that contradict the others, and why; they have no pose.
+        common_errors: of the outlines, whose part beyond the model is the component `unexplained`.
+        blur_px: of the outlines' edges, in the median.
+    """
+
+    poses: str
+    camera: Camera
+    outlines: Hash
+    full_camera: Camera | None = None
+    T_world_scan: Matrix
+    scale: float
+    rms_px: float
+    T_world_station: dict[str, Matrix]
+    T_scan_camera: dict[str, Matrix]
+    T_scan_camera_given: dict[str, Matrix] | None = None
+    covariance_given: Matrix | None = None
+    excluded: tuple[str, ...] = ()
+    covariance: Matrix
+    components: dict[str, Matrix]
+    leave_one_out: LeaveOneOut | None = None
+    pose_sigma_m: float | None = None
+    pose_sigma_rad: float | None = None
+    findings: tuple[Contradiction, ...] = ()
+    left_out: dict[str, str] = Field(default_factory=dict[str, str])
+    common_errors: tuple[CommonError, ...] = ()
+    blur_px: float | None = None
+
+
+class Registrations(JobRecord):
+    """The registrations in the result of a registration step, by name, and the further cameras of the rig."""
+
+    registrations: dict[str, Registration] = Field(default_factory=dict[str, Registration])
+    cameras: dict[str, further_camera.Answer] = Field(default_factory=dict[str, further_camera.Answer])
+
+
+KIND = JobKind(
+    name="register",
+    arguments=Arguments,
+    answer=Registration,
+    compute="service.worker.register:register",
+    words="registration",
+    version=4,  # states that light displaces single spheres
+    order=61,
+    demand=lambda arguments: Demand(memory_mb=500 + len(arguments.images), limit_s=3600 + 20 * len(arguments.images)),
+)

@@ -1,1 +1,0 @@
-"""Kinds of jobs that bring images and scan into one frame, and judge how well."""

@@ -1,1 +1,0 @@
-"""Kinds of jobs on surfaces and on the spheres in them."""

@@ -1,1 +1,0 @@
-"""Content-addressed files, leftovers of crashes, and used disk space."""

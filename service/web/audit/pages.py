@@ -1,0 +1,266 @@
+"""The auditor's pages of a run's gates, devices, corrections and signatures, and of whether its evidence verifies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Form, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+
+from service.audit.background import PartialProgress
+from service.audit.overview import findings, first_page
+from service.audit.overview.devices import bodies_of_run, clock_offsets, opened_devices, sessions
+from service.audit.overview.digest import Digest
+from service.audit.overview.findings import correct
+from service.audit.overview.signatures import signatures
+from service.audit.record import rows, search
+from service.core.clocks import clock_offset_words, clock_readings
+from service.core.gates.measure_names import measure_name
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import RunState, StepState
+from service.dataset.registrations import evaluated, own_registration
+from service.steps import step_kinds
+from service.steps.notes import deidentified
+from service.steps.protocol_check import measures_of
+from service.web.audit.frame import CurrentAudit, audit_frame, link
+from service.web.page.rendering import render
+from service.web.page.run_frame import sentence
+from service.web.record.images import further_cameras_of
+from service.web.run.actions import Reason
+from service.web.run.view_records import GateLine, gate_lines
+from service.web.security import SignedInPerson, requires
+
+router = APIRouter(tags=["audit"])
+_ERROR, _PIXELS = "mean_radial_error_mm", "mean_reprojection_error_px"
+
+
+@dataclass(frozen=True, slots=True)
+class StepGates:
+    """The gates of one step as its last attempt was judged, and how many earlier judgements failed."""
+
+    step: str
+    title: str
+    attempt: int
+    lines: tuple[GateLine, ...]
+    failed_before: int
+
+
+@dataclass(frozen=True, slots=True)
+class AccuracyRow:
+    """One row of the accuracy table, compared with the limit by which the run's own registration was judged."""
+
+    poses: str
+    error_mm: float | None
+    reprojection_px: float | None
+    images: str
+    late: str
+    limit: str  # "" where the protocol sets none
+    within: bool | None
+    own: bool  # the run's own registration: what a data set is exported with
+
+
+@router.get(
+    "/audit/runs/{run_id}/gates",
+    name="audit_gates",
+    dependencies=[Depends(requires("read"))],
+    response_class=HTMLResponse,
+)
+def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """Every gate of every step, in the order of the protocol."""
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    return render(
+        request,
+        "audit/gates.html.j2",
+        audit=audit_frame(audit, run_id, "/gates"),
+        progress=digest if isinstance(digest, PartialProgress) else None,
+        steps=gates_of(known) if known else [],
+    )
+
+
+def gates_of(digest: Digest) -> list[StepGates]:
+    """The steps that have gates."""
+    protocol, state = digest.protocol, digest.state
+    if protocol is None or state is None:
+        return []
+    out: list[StepGates] = []
+    for step in protocol.steps:
+        if not step.gates:
+            continue
+        now = state.steps[step.id]
+        failed = sum(gate.step == step.id and gate.attempt < now.attempt for gate in digest.failed_gates)
+        lines = _explained(protocol, step, now, state.skipped)
+        out.append(StepGates(step.id, step.title, now.attempt, lines, failed))
+    return out
+
+
+def _explained(protocol: Protocol, step: Step, now: StepState, skipped: frozenset[str]) -> tuple[GateLine, ...]:
+    """Return the gates of a step; where the protocol gives no reason for a limit, what its measure means."""
+    kind = step_kinds().get(step.kind)
+    measures = {} if kind is None else kind.measures.declared()
+    measures |= measures_of(step, {known.id: known for known in protocol.steps}) or {}
+    meanings = {name: sentence(measure.meaning) for name, measure in measures.items() if measure.meaning}
+    lines = zip(step.gates, gate_lines(step, now, skipped), strict=True)
+    return tuple(replace(line, why=line.why or meanings.get(gate.measure, "")) for gate, line in lines)
+
+
+def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:
+    """The accuracy on the control spheres of every source of poses; empty before the evaluation."""
+    if digest is None or digest.protocol is None or digest.state is None:
+        return []
+    return _accuracy(digest.protocol, digest.state)
+
+
+def _accuracy(protocol: Protocol, state: RunState) -> list[AccuracyRow]:
+    rows = evaluated(protocol, state)
+    own = own_registration(protocol, state)
+    gates = [gate for step in protocol.steps if step.gives == "accuracy" for gate in step.gates]
+    most = next((gate.max for gate in gates if gate.measure.endswith(_ERROR)), None)
+    out: list[AccuracyRow] = []
+    for row in rows:
+        error = row.mean_radial_error_mm
+        out.append(
+            AccuracyRow(
+                poses=row.poses,
+                error_mm=error,
+                reprojection_px=row.mean_reprojection_error_px,
+                images="" if row.images is None else str(row.images),
+                late=row.late,
+                limit="" if most is None else f"at most {most:g} mm",
+                within=None if most is None else error <= most,
+                own=row.poses == own,
+            )
+        )
+    return out
+
+
+@router.get(
+    "/audit/runs/{run_id}/devices",
+    name="audit_devices",
+    dependencies=[Depends(requires("read"))],
+    response_class=HTMLResponse,
+)
+def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """Devices with versions, clocks, troubles; sessions and software."""
+    frame = audit_frame(audit, run_id, "/devices")
+    with audit.site.store.database.reading() as connection:
+        opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
+        started = findings.events_of(connection, run_id, "session_started", newest=True)
+        troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
+        trouble_count = rows.count_of_kind(connection, run_id, "device_trouble")
+        clocks = clock_offsets(connection, run_id)
+        bodies = bodies_of_run(connection, run_id, opened)
+    log = audit.site.run(run_id)
+    readings = clock_readings(log.events)
+    return render(
+        request,
+        "audit/devices.html.j2",
+        audit=frame,
+        opened=opened,
+        bodies=bodies,
+        removed=[one.words for state in log.state.steps.values() for one in deidentified(state)],
+        clock_offset_words=clock_offset_words,
+        sessions=sessions(started),
+        troubles=troubles[-50:],
+        trouble_count=trouble_count,
+        clocks=clocks,
+        readings=readings,
+        further=further_cameras_of(log),
+    )
+
+
+_READ = [Depends(requires("read"))]
+
+
+@router.get(
+    "/audit/runs/{run_id}/corrections", name="audit_corrections", dependencies=_READ, response_class=HTMLResponse
+)
+def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: int = 1) -> Response:
+    """Old and new: corrected values, steps done again, views taken again."""
+    frame = audit_frame(audit, run_id, "/corrections")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    views = findings.replaced_viewpoints(known) if known else []
+    pages = max(1, -(-len(views) // rows.PAGE))
+    page = min(max(page, 1), pages)
+    shown = views[(page - 1) * rows.PAGE : page * rows.PAGE]
+    with audit.site.store.database.reading() as connection:
+        values = findings.corrected_values(connection, run_id)
+        steps = findings.replaced_steps(connection, run_id, known) if known else []
+        seqs = sorted({seq for view in shown for seq in (view.old_seq, view.new_seq) if seq})
+        pictures = {
+            row.seq: row for row in reversed(search.artefacts_of_events(connection, run_id, seqs)) if row.is_picture
+        }
+        corrected = rows.count_of_kind(connection, run_id, "record_corrected")
+    return render(
+        request,
+        "audit/corrections.html.j2",
+        audit=frame,
+        progress=digest if isinstance(digest, PartialProgress) else None,
+        values=values,
+        corrected=corrected,
+        steps=steps,
+        views=shown,
+        view_count=len(views),
+        pictures=pictures,
+        page=page,
+        pages=pages,
+        measure_name=measure_name,
+        href=lambda number: link(f"{frame.base}/corrections", {"page": number}),
+    )
+
+
+@router.post("/audit/runs/{run_id}/corrections", name="correct", dependencies=[Depends(requires("correct"))])
+def correct_value(
+    audit: CurrentAudit,
+    person: SignedInPerson,
+    run_id: str,
+    of_seq: Annotated[int, Form(ge=1, le=2**53)],
+    field: Annotated[str, Form(min_length=1, max_length=400)],
+    new: Annotated[str, Form(max_length=4000)],
+    reason: Reason,
+) -> Response:
+    """Record a correction; the original stays."""
+    audit_frame(audit, run_id, "/corrections")
+    correct(audit.site.store, run_id, of_seq=of_seq, field=field, new=new, reason=reason, actor=person.account)
+    return RedirectResponse(f"/audit/runs/{run_id}/corrections", status_code=303)
+
+
+@router.get(
+    "/audit/runs/{run_id}/signatures", name="audit_signatures", dependencies=_READ, response_class=HTMLResponse
+)
+def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """Show who signed what, and whether the signature is still valid."""
+    frame = audit_frame(audit, run_id, "/signatures")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    with audit.site.store.database.reading() as connection:
+        found = signatures(connection, run_id, known)
+    return render(
+        request,
+        "audit/signatures.html.j2",
+        audit=frame,
+        signatures=found,
+        digest=known,
+        progress=digest if isinstance(digest, PartialProgress) else None,
+    )
+
+
+@router.get(
+    "/audit/runs/{run_id}/verification", name="audit_verification", dependencies=_READ, response_class=HTMLResponse
+)
+def verification_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """What the last verification found, or how far the current one is."""
+    return render(request, "audit/verification.html.j2", audit=audit_frame(audit, run_id, "/verification"))
+
+
+@router.post("/audit/runs/{run_id}/verification", name="verify", dependencies=_READ)
+def verify_now(
+    audit: CurrentAudit, person: SignedInPerson, run_id: str, back: Annotated[Literal["", "exports"], Form()] = ""
+) -> Response:
+    """Verify the run. It only reads, so everybody who may read may start it."""
+    audit_frame(audit, run_id, "/verification")
+    audit.verifications.start(run_id, person.account)
+    shown = f"/runs/{run_id}/exports" if back else f"/audit/runs/{run_id}/verification"
+    return RedirectResponse(shown, status_code=303)

@@ -1,1 +1,0 @@
-"""Health and metrics for machines that watch this one."""

@@ -1,1 +1,0 @@
-"""Who may do what: sign-in, permissions, safety headers and the sealed record."""

@@ -1,1 +1,0 @@
-"""The HTTP server, its listening socket and its limits on connections."""

@@ -1,1 +1,0 @@
-"""Jobs on images of the calibration board."""

@@ -1,1 +1,0 @@
-"""Jobs while images are being taken, by the robot or by hand."""

@@ -1,1 +1,0 @@
-"""Jobs that estimate camera poses from images, and camera poses from those of the robot."""

@@ -1,1 +1,0 @@
-"""Jobs that bring images and scan into one frame, and judge how well."""

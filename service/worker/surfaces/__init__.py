@@ -1,1 +1,0 @@
-"""Jobs on meshes, and on the spheres in them and in photographs of the layout."""
