@@ -224,6 +224,6 @@ TARGETS: tuple[Target, ...] = (
     Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
     Target("own_ply", "service.compute.ground_truth.surface:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview_records:read_preview", _preview, _previews, JSON),
-    Target("export_request", "service.audit.export.exports:kept_request", _request, _requests, JSON),
+    Target("export_request", "service.audit.export.wanted:kept_request", _request, _requests, JSON),
     Target("region", "service.run_acts:read_region", _region, _regions, JSON),
 )  # fmt: skip
