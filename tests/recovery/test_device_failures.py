@@ -149,7 +149,7 @@ def test_exif_that_departs_from_the_settings_fails_its_gate_until_the_image_is_t
     state = bench.run()
     assert state.status == "completed"
     question = next(q for q in bench.operator.asked if q.for_ == "recovery")
-    assert "settings_departures" in question.text
+    assert "Images with wrong camera settings" in question.text
     assert bench.captured() == [*VIEWS, "v003"]
     verdicts = [c.verdicts["settings"] for c in bench.payloads(ViewpointCaptured)]
     assert verdicts == [True, True, False, True, True]

@@ -126,7 +126,7 @@ def test_he_gives_up_after_a_few_mends_that_did_not_help(
 ) -> None:
     bench.rig.shutter.exif = other_settings
     advise(monkeypatch, ADVICE)
-    with pytest.raises(OrthocaptureError, match="settings_departures"):
+    with pytest.raises(OrthocaptureError, match="Images with wrong camera settings 4"):
         automatic_run(bench, world)
     assert len(mends(bench)) == 4
     assert bench.state().phase == "recovering", "the run is whole and can be resumed"
@@ -138,7 +138,7 @@ def test_without_advice_from_this_attempt_he_leaves_it_to_a_person(
     bench.rig.shutter.exif = other_settings
     advise(monkeypatch, None)
     bench.store.record(bench.run_id, [StepNote(step="fixation", attempt=1, note="wheel", data=ADVICE)], actor="")
-    with pytest.raises(OrthocaptureError, match="settings_departures"):
+    with pytest.raises(OrthocaptureError, match="Images with wrong camera settings 4"):
         automatic_run(bench, world)
     assert not mends(bench)
     assert not world.asked
