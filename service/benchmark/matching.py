@@ -33,7 +33,7 @@ _Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """What has to be right about a pair of the list."""
+    """A pair of the list, with the fields that are checked when the list is read."""
 
     first: str
     second: str
@@ -44,7 +44,7 @@ class _Pair:
 
 @dataclass(frozen=True, slots=True)
 class MatchingTask:
-    """What is to be run.
+    """One run of a matching method: the data set, the method and where its result goes.
 
     Attributes:
         dataset: folder exported with the format `matching`.
@@ -71,7 +71,7 @@ def run_matching(wanted: MatchingTask, progress: Progress) -> list[MethodResult]
         all results, by the names of their methods.
 
     Raises:
-        ConfigurationError: what the method needs is not installed or not given.
+        ConfigurationError: the method's weights or packages are not installed or not given.
         DataError: the data set or a result in the folder cannot be read, or results are of other pairs.
     """
     data = open_matching_data(wanted.dataset)

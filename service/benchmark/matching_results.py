@@ -27,10 +27,10 @@ class ClassScore:
     """The score of a method on a class of pairs.
 
     Attributes:
-        name: of the class, or ALL.
+        name: the class's name, or ALL.
         pairs: number of pairs.
-        auc: of the pose error at each of THRESHOLDS_DEG.
-        precision: at each of PRECISION_PX: mean over the pairs.
+        auc: area under the curve of the pose error up to each of THRESHOLDS_DEG.
+        precision: mean precision over the pairs at each of PRECISION_PX.
         epipolar_px: median over the pairs of their medians; infinite if most have no match.
         matches: mean number.
         scored: share of the matches with ground truth.
@@ -49,13 +49,13 @@ class ClassScore:
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """What a method scored.
+    """The scores of one method on every pair of a list.
 
     Attributes:
         method, words: its name, and what it is called in tables.
-        dataset_sha256: of the list of pairs.
+        dataset_sha256: SHA-256 of the list of pairs.
         simulated: no camera was in front of a specimen.
-        scores: of the pairs.
+        scores: one score for each pair.
     """
 
     method: str

@@ -76,9 +76,9 @@ def compare(
 
     Args:
         cut: the mesh without what the truth does not cover.
-        truth: what it is compared with.
-        settings: of the comparison.
-        outside_percent: of the method's surface, that was cut off before.
+        truth: the mesh that it is compared with.
+        settings: the settings of the comparison.
+        outside_percent: share of the method's surface that was cut off before.
 
     Raises:
         ComputeError: the meshes cannot be compared.

@@ -180,11 +180,11 @@ _PANEL_PX = 520
 
 
 def figure(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> NDArray[np.uint8]:
-    """(H, W, 3) picture, blue first: a row for each scenario and a column for each method, of the newest data set.
+    """Draw (H, W, 3), blue first: a row for each scenario and a column for each method, of the newest data set.
 
     Args:
         out: folder of the results, with the meshes as they were scored and the truth.
-        results: from that folder.
+        results: the results in that folder.
         known: the methods.
 
     Raises:

@@ -74,7 +74,7 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
     Args:
         joints_rad: (J,) or (N, J) as reported by the controller.
         T_base_flange: (4, 4) or (N, 4, 4) as reported by the controller.
-        correction: from a hand-eye calibration of the same arm.
+        correction: the correction estimated by a hand-eye calibration of the same arm.
 
     Returns:
         Corrected poses in the shape of `T_base_flange`.
@@ -157,10 +157,10 @@ def correction_design(arm: ArmModel, joints_rad: Array, about: ArmCorrection) ->
 
 
 def _dh_tolerances(arm: ArmModel) -> Array:
-    """(`dh_count`,) one standard deviation of each parameter of the geometry.
+    """Return (`dh_count`,) one standard deviation of each parameter of the geometry.
 
-    Those of the last joint are zero: its errors move the camera with the flange, and nothing can tell them from
-    another mount of the camera. They stay in T_flange_camera, for whose purpose they are no errors.
+    Those of the last joint are zero: its errors move the camera with the flange, and nothing can distinguish them
+    from another mount of the camera. They stay in T_flange_camera, for whose purpose they are no errors.
     """
     of = np.tile(arm.tolerances.dh, (arm.axes, 1))
     if arm.tolerances.lengths_m:

@@ -118,11 +118,11 @@ def dh_jacobian(frames: Array) -> Array:
 
 
 def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:
-    """(N, 6, K) derivative of the flange's pose by β of K joints, in the form of `dh_jacobian`.
+    """Return the (N, 6, K) derivative of the flange's pose by β of K joints, in the format of `dh_jacobian`.
 
     Args:
-        frames: (N, J + 1, 4, 4) as from `chain`.
-        joints: of the axes to which the next is parallel, from 0.
+        frames: (N, J + 1, 4, 4) frames from `chain`.
+        joints: indices, from 0, of the axes to which the next axis is parallel.
     """
     flange = frames[:, -1, :3, 3]
     to_flange = np.swapaxes(frames[:, -1, :3, :3], 1, 2)

@@ -72,8 +72,8 @@ class Descent(Generic[StateT]):
     Attributes:
         state: the best state found.
         steps: number of steps tried.
-        settled: whether a step settled, before the steps ran out or none helped any more.
-        stuck: whether the damping exceeded its limit, because no step helped any more.
+        settled: true if a step settled, before the steps ran out or none helped any more.
+        stuck: true if the damping exceeded its limit, because no step helped any more.
     """
 
     state: StateT
@@ -98,7 +98,7 @@ def levenberg_marquardt(
         start: initial state, with its linearisation and cost.
         candidate_of: the linearised state after a step from a state with a given damping.
         gain_of: decrease of the cost from a state to a candidate; minus infinity if it is not a number.
-        settles: whether the step from a state to a candidate, accepted or not, is the last.
+        settles: says if the step from a state to a candidate, accepted or not, is the last.
         damping: its schedule.
         most: largest number of steps tried.
         renewed: updates an accepted state's weights or other parts of its cost; None: nothing is updated.
@@ -128,7 +128,7 @@ def halved_gauss_newton(
     *,
     most: int,
 ) -> Descent[StateT]:
-    """Gauss–Newton that halves a step, down to a thousandth, as long as it would increase the cost.
+    """Take Gauss–Newton steps, each halved, down to a thousandth, as long as it would increase the cost.
 
     It is `levenberg_marquardt` with the step's divisor in place of the damping. Where some unknowns are eliminated
     with a covariance of their own, damping would not shorten all in proportion.
@@ -136,8 +136,8 @@ def halved_gauss_newton(
     Args:
         start: initial state, with its cost and its Gauss–Newton step.
         candidate_of: the same after a share (0 … 1] of a state's step.
-        gain_of: as for `levenberg_marquardt`.
-        settles: as for `levenberg_marquardt`.
+        gain_of: the same as in `levenberg_marquardt`.
+        settles: the same as in `levenberg_marquardt`.
         most: largest number of steps tried.
     """
     return levenberg_marquardt(

@@ -43,9 +43,9 @@ class HandView:
     """The result of looking at one image.
 
     Attributes:
-        T_scene_camera: (4, 4) in the spheres' frame; None if the spheres do not determine it.
-        information: about the scan's pose relative to the camera; None without a pose.
-        why: why the image is unusable; empty if it is good.
+        T_scene_camera: (4, 4) camera pose in the spheres' frame; None if the spheres do not determine it.
+        information: information about the scan's pose relative to the camera; None without a pose.
+        why: the reason why the image is unusable; empty if it is good.
         shown: outlines by sphere.
     """
 
@@ -73,7 +73,7 @@ def look_at_image(
     """Search a whole image (H, W, 3) for the spheres (M, 3), without a predicted camera pose.
 
     Args:
-        rough: whether the sphere centres come from photographs alone; they and the camera pose are then only good to
+        rough: true if the sphere centres come from photographs alone; they and the camera pose are then only good to
             some millimetres.
     """
     outlines = detect_spheres(image_bgr, camera, options)
@@ -153,7 +153,7 @@ def pose_by_spheres(
 
 
 def _fault(edge_px: float, seen: int, expected: int) -> str:
-    """What is wrong with an image whose camera pose is known; empty if nothing."""
+    """Describe what is wrong with an image whose camera pose is known; empty if nothing."""
     if edge_px > _MOST_EDGE_PX:
         return f"blurred: outlines are {edge_px:.1f} px wide; hold the camera still"
     if expected >= _LEAST_SPHERES and seen < _LEAST_SHARE * expected:
@@ -171,12 +171,12 @@ def _exposure(image_bgr: NDArray[np.uint8], clipped: float) -> str:
 def poses_by_spheres(
     outlines: Sequence[Sequence[SphereOutline]], names: Sequence[str], camera: CameraModel, spheres: ScanSpheres
 ) -> dict[str, Transform]:
-    """T_scan_camera of every image whose spheres determine it, by its name; each from its own image.
+    """Compute T_scan_camera, (4, 4), of every image whose spheres determine it, by its name; each from its own image.
 
     Args:
-        outlines: of N images, each searched whole.
-        names: of the N images.
-        camera: of the images.
+        outlines: the outlines of N images, each searched whole.
+        names: the names of the N images.
+        camera: the camera of the images.
         spheres: the registration spheres.
 
     Raises:
@@ -206,7 +206,7 @@ class ImageReading:
 
     @classmethod
     def of(cls, viewpoint: str, T_scene_camera: Transform, shown: Mapping[int, SphereOutline]) -> ImageReading:
-        """From an image's outlines by sphere."""
+        """Build the reading from an image's outlines by sphere."""
         outlines = list(shown.values())
         return cls(
             viewpoint,

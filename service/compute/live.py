@@ -90,8 +90,8 @@ def register_station(
     Args:
         views: any number of images with their outlines.
         spheres_m: (M, 3) in the frame of the scan or the CT.
-        T_base_scan: from a registration of earlier images, by which spheres are identified; None: identified from
-            scratch.
+        T_base_scan: result of a registration of earlier images, by which spheres are identified; None: they are
+            identified from scratch.
 
     Raises:
         ComputeError: the outlines do not determine an answer yet.

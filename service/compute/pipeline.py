@@ -187,13 +187,14 @@ def register_images(
         outlines: per image, from `locate_outlines` or `detect_all`.
         images: camera, poses and names of the images. If the poses are not metric, their scale is estimated.
         spheres: registration spheres, and control spheres if there are any.
-        settings: as for `register`.
+        settings: the settings of `register`.
         assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
             identified here.
-        search: searches images for control spheres that the outlines lack; None: they count as not measured.
+        search: searches images for control spheres that are missing among the outlines; None: they count as not
+            measured.
         lens_covariance: (8, 8) of the calibration, which adds the component INTRINSICS to the covariance.
         calibrated: (8, 8) of the calibration, with which the check compares; None: `lens_covariance`.
-        check: whether to look for contradictions: images that contradict the others are left out, and what the model
+        check: true to look for contradictions: images that contradict the others are left out, and what the model
             does not explain adds the component UNEXPLAINED.
 
     Raises:

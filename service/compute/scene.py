@@ -21,8 +21,8 @@ class PosedImages:
         poses: (N, 4, 4) T_world_camera, or T_base_camera in the base frame of each image's station.
         camera: intrinsics of all images.
         groups: (N,) station of each image; images of one station share a base frame. None: all the same.
-        metric: whether the positions are in metres; if not, their scale is estimated.
-        names: of the images, for messages and results; empty: "image 0", "image 1" and so on.
+        metric: true if the positions are in metres; if not, their scale is estimated.
+        names: names of the images, for messages and results; empty: "image 0", "image 1" and so on.
     """
 
     poses: Array = field(repr=False)

@@ -47,8 +47,8 @@ class Board:
             even).
         size_tolerance: largest relative error of `square_m`, as the maker states it.
         flatness_m: largest bow of the board, as the maker states it; 0: exactly flat.
-        bow_m: by how much the board's middle lies behind its sides, and behind its ends: the rise of an arc along the
-            columns and of one along the rows; negative if the middle comes towards the camera.
+        bow_m: how far the board's middle lies behind its sides, and behind its ends, in metres: the rise of an arc
+            along the columns and of one along the rows; negative if the middle comes towards the camera.
     """
 
     columns: int
@@ -95,7 +95,7 @@ class Board:
         return np.stack([x, row.ravel() * self.square_m, np.zeros(x.size)], axis=1)
 
     def half_turn(self) -> Transform | None:
-        """T_board_turned if the board looks the same after half a turn; None if its ends can be told apart."""
+        """T_board_turned if the board looks the same after half a turn; None if its ends can be distinguished."""
         if self.pattern == "charuco" or (self.pattern == "circles" and self.rows % 2):
             return None
         if self.pattern == "circles":
@@ -154,7 +154,7 @@ def board_points(columns: int, rows: int, square_m: float) -> Array:
 
 
 def half_turn(columns: int, rows: int, square_m: float) -> Transform | None:
-    """T_board_turned of a checkerboard that looks the same after half a turn; None if colours tell its ends apart.
+    """Return T_board_turned of a checkerboard that half a turn leaves alike; None if colours distinguish its ends.
 
     With one even and one odd number of inner corners, opposite corners have opposite colours.
     """
@@ -273,7 +273,7 @@ def half_window(spacing_px: float, reach: float) -> int:
 
 
 def _first_square_is_dark(image: Grey, grid: Array) -> bool:
-    """Whether the first square is dark, by the mean brightness at the centres of the squares of each colour."""
+    """Return whether the first square is dark, by the mean brightness at the centres of both colours' squares."""
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     x = np.clip(centres[..., 0].round().astype(int), 0, image.shape[1] - 1)
     y = np.clip(centres[..., 1].round().astype(int), 0, image.shape[0] - 1)

@@ -63,7 +63,7 @@ def board_candidates(
         wishes: tilts, rolls and distances.
         approach: (3,) horizontal unit vector from the scene towards the base; images are upright for a viewer there.
         most: number of poses tried, drawn at random from all combinations.
-        seed: of the draw.
+        seed: seed of the draw.
         draw: 1 for the next so many combinations, which the draw before did not have, and so on.
 
     Returns:
@@ -175,7 +175,7 @@ _TRIED = 40  # of the best ones, until the arm can take one
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTargets:
-    """Which calibrations the images are for, and their targets."""
+    """The calibrations that the images are for, and their targets."""
 
     intrinsics: bool = True
     hand_eye: bool = True
@@ -191,11 +191,11 @@ class PlanPrediction:
         images: number of images.
         coverage: share of the image's cells with a corner.
         coverage_map: (8, 12) corners in each cell.
-        uncertainty_mm: of a projected point at the board's distance, worst in the image; NaN if the images do not
-            determine the camera.
+        uncertainty_mm: uncertainty of a projected point at the board's distance, in mm, worst in the image; NaN if
+            the images do not determine the camera.
         tilt_deg: largest tilt of the board.
         rotation_spread_deg: largest rotation between two images.
-        hand_eye_sigma_mm, hand_eye_sigma_deg: of T_flange_camera.
+        hand_eye_sigma_mm, hand_eye_sigma_deg: standard deviation of T_flange_camera.
     """
 
     images: int
@@ -225,7 +225,7 @@ NOTHING = ChosenViews(np.zeros((0, 4, 4)))
 
 @dataclass(frozen=True, slots=True)
 class DesignProblem:
-    """What images of the board are to determine.
+    """The unknowns that images of the board must determine, and how well.
 
     Attributes:
         known: estimates of camera, mount and board.
@@ -243,7 +243,7 @@ class DesignProblem:
         return ChosenViews(poses, tuple(expected_pixels(self.known, self.board, poses)))
 
     def predict(self, taken: ChosenViews) -> PlanPrediction:
-        """What calibrations from these images will achieve."""
+        """Predict the accuracy of calibrations from these images."""
         known, board, sigma_px = self.known, self.board, self.aims.corner_sigma_px
         counts = _counts(taken.pixels, known)
         boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
@@ -277,16 +277,16 @@ def choose_poses(
     enough: Callable[[PlanPrediction], bool] | None = None,
     seed: int = 0,
 ) -> Array:
-    """Up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
+    """Return up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
 
     Args:
-        problem: what the images are to determine.
-        candidates: to choose from.
+        problem: the unknowns that the images must determine.
+        candidates: the poses to choose from.
         count: largest number of poses.
         taken: images that count already.
-        feasible: whether the arm can go there; asked only for the best candidates.
-        enough: asked after each pose; once it returns True, no more are chosen.
-        seed: of the random samples of later picks.
+        feasible: says if the arm can go there; called only for the best candidates.
+        enough: called after each pose; once it returns True, no more are chosen.
+        seed: seed of the random samples of later picks.
     """
     rng = np.random.default_rng([seed, 0x9A5E])
     worth = _InformationGain(problem)
@@ -355,7 +355,7 @@ class _InformationGain:
         return self.prior + lens.sum(axis=0), weak + mount.sum(axis=0)
 
     def plus(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], k: int) -> tuple[Array, Array]:
-        """With candidate `k` added."""
+        """Add the information of candidate `k`."""
         return so_far[0] + gains[0][k], so_far[1] + gains[1][k]
 
     def cost(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], pool: NDArray[np.int64]) -> Array:

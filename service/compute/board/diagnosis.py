@@ -33,12 +33,12 @@ _DICTIONARIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What an image shows instead of the described board.
+    """A reason why an image does not show the described board.
 
     Attributes:
-        words: for people, without a full stop.
-        remedy: what to do.
-        of_board: whether the description is wrong, and so fails for every image; otherwise only this image is at
+        words: the text for people, without a full stop.
+        remedy: the advice to the user.
+        of_board: true if the description is wrong, and so fails for every image; otherwise only this image is at
             fault.
     """
 
@@ -141,7 +141,7 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def _at_frame(corners: Array, shape: tuple[int, ...]) -> bool:
-    """Whether the next row or column of corners would lie outside the image."""
+    """Return whether the next row or column of corners would lie outside the image."""
     spacing = max(
         float(np.median(np.linalg.norm(np.diff(corners, axis=0), axis=2))),
         float(np.median(np.linalg.norm(np.diff(corners, axis=1), axis=2))),

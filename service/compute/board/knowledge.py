@@ -1,4 +1,4 @@
-"""Holds what is known of the board's place and the camera's mount, and predicts what further images would tell."""
+"""Holds what is known of the board's place and the camera's mount, and predicts what further images would show."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Tolerances:
     """Tolerances as bounds, for each axis.
 
     Attributes:
-        mount_m, mount_rad: of the camera on the flange, from its drawing.
-        place_m: of the board's middle, horizontally, including how well the scene's centre was measured.
-        height_m: of the board's middle, vertically.
-        turn_rad: of the board about the vertical.
-        tilt_rad: of the board from the horizontal.
-        focal: of the focal length, relative.
-        centre: of the principal point, over the image's width.
+        mount_m, mount_rad: error of the camera on the flange against its drawing.
+        place_m: horizontal position of the board's middle, including how well the scene's centre was measured.
+        height_m: vertical position of the board's middle.
+        turn_rad: rotation of the board about the vertical.
+        tilt_rad: tilt of the board from the horizontal.
+        focal: focal length, relative.
+        centre: principal point, over the image's width.
     """
 
     mount_m: float = 0.002
@@ -100,15 +100,15 @@ def nominal_knowledge(
     long_side_across: bool = True,
     tolerances: Tolerances = Tolerances(),
 ) -> BoardKnowledge:
-    """The knowledge before any image.
+    """Return the knowledge before any image.
 
     Args:
         camera: nominal, for the images' size.
-        T_flange_camera: from the mount's drawing.
+        T_flange_camera: the camera's pose on the flange by the mount's drawing.
         middle_m: (3,) intended place of the board's middle, base frame.
         approach: (3,) horizontal unit vector from the scene towards the base.
         board: lies face up and level.
-        long_side_across: whether the board's long side runs across the approach; otherwise along it.
+        long_side_across: true if the board's long side runs across the approach; otherwise it runs along it.
         tolerances: bounds.
     """
     middle = board.points().mean(axis=0)

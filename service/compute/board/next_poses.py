@@ -55,19 +55,19 @@ def suggest_board_poses(
     count: int = 6,
     reachable: Callable[[Transform], bool] | None = None,
 ) -> tuple[SuggestedPose, ...]:
-    """Greedy A-optimal choice among arcs and rolls around the board, on the linearised weighted problem.
+    """Choose poses by greedy A-optimality among arcs and rolls around the board, on the linearised weighted problem.
 
     The criterion is the mean square displacement that T_flange_camera's error causes at the board's distance.
     Candidates show the whole board.
 
     Args:
         answer: the calibration so far; its robot noise weights the poses.
-        T_base_flange: (N, 4, 4) taken so far.
-        points_m: (P, 3) of the board.
-        camera: calibrated.
+        T_base_flange: (N, 4, 4) poses taken so far.
+        points_m: (P, 3) the board's points.
+        camera: the calibrated camera.
         corner_sigma_px: standard deviation of a corner.
         count: number of poses wanted.
-        reachable: whether the arm can take a flange pose; asked only for the best candidates.
+        reachable: says if the arm can take a flange pose; called only for the best candidates.
 
     Returns:
         Up to `count` poses in the order of their gain; fewer if no others are reachable.
@@ -153,7 +153,7 @@ class _Model:
 
     @classmethod
     def of(cls, answer: HandEyeAnswer, points_m: Array, camera: CameraModel, corner_sigma_px: float) -> _Model:
-        """With the robot's noise from the calibration so far."""
+        """Build the model with the robot's noise from the calibration so far."""
         robot = np.diag(
             [max(metres(answer.robot_noise_mm or 0.0), _FLOOR_M) ** 2] * 3
             + [max(np.radians(answer.robot_noise_deg or 0.0), _FLOOR_RAD) ** 2] * 3

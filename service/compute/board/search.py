@@ -30,7 +30,7 @@ _PROBED = 4  # images tried before all are searched
 
 @dataclass(frozen=True, slots=True)
 class BoardImage:
-    """What one image file shows; if it cannot be used, `view` is None and `reason` says why."""
+    """The content of one image file; if it cannot be used, `view` is None and `reason` says why."""
 
     size: tuple[int, int]
     view: BoardView | None
@@ -133,7 +133,7 @@ def usable_views(found: Sequence[BoardImage]) -> UsableViews:
 
 
 def _worth_processes(files: Sequence[Path]) -> bool:
-    """Whether the work outweighs the start of processes."""
+    """Return whether the work outweighs the start of processes."""
     return len(files) >= _MANY_FILES or sum(file.stat().st_size for file in files if file.is_file()) > _MANY_BYTES
 
 
@@ -168,17 +168,17 @@ _OUTLIER_FLOOR_PX = 0.3
 
 
 def find_part(image: Grey, board: Board, known: BoardKnowledge, T_base_camera: Transform) -> BoardView:
-    """The visible corners of a checkerboard, numbered by their predicted positions.
+    """Find the visible corners of a checkerboard, numbered by their predicted positions.
 
-    Each is refined from its predicted position. It is kept only if it is a crossing of four squares of the right
+    Each is refined from its predicted position. It is accepted only if it is a crossing of four squares of the right
     colours and fits one board pose together with the others. All of them may be shifted by up to a quarter of a
     square.
 
     Args:
         image: grey, 8 bits.
         board: a checkerboard.
-        known: camera, mount and board, from other images.
-        T_base_camera: of this image, from the arm's pose and the mount.
+        known: camera, mount and board as other images show them.
+        T_base_camera: (4, 4) the camera's pose for this image, from the arm's pose and the mount.
 
     Raises:
         ComputeError: too little of the board is visible, or it is not where it was predicted.
@@ -221,13 +221,13 @@ def with_parts(
     known: BoardKnowledge,
     T_base_flange: Array,
 ) -> tuple[BoardImage, ...]:
-    """The images, with parts of the board in those without a whole one; where that failed, the reason says why.
+    """Search images without a whole board for parts of it; where that fails, the reason says why.
 
     Args:
         images: (N) from `find_boards`.
         greys: (N) pixels of the images without a view; None for the others.
         board: a checkerboard.
-        known: from the images with a view.
+        known: camera, mount and board as the images with a view show them.
         T_base_flange: (N, 4, 4).
     """
     out: list[BoardImage] = []

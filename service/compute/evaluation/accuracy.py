@@ -115,12 +115,12 @@ def evaluate(
 
 
 def leave_one_out(registration: RegistrationResult, *, refined: bool = False) -> Evaluation:
-    """Errors of each registration sphere predicted from the others, for evaluation without control spheres.
+    """Evaluate each registration sphere as predicted from the others, for an evaluation without control spheres.
 
     Args:
-        registration: with its solution, from which each sphere's outlines are removed in turn (one linear step; the
-            weights of the outlines and the variance components stay).
-        refined: whether to predict with the camera poses corrected by their errors, estimated from the other spheres.
+        registration: the registration with its solution, from which each sphere's outlines are removed in turn (one
+            linear step; the weights of the outlines and the variance components stay).
+        refined: true to predict with the camera poses corrected by their errors, estimated from the other spheres.
 
     A sphere without which a station would see fewer than three is left out of the result.
 

@@ -34,17 +34,18 @@ SearchNearby = Callable[[ExpectedNearby], Sequence[Sequence[SphereOutline]]]
 
 @dataclass(frozen=True, slots=True)
 class ControlSphere:
-    """What one control sphere shows.
+    """The evaluation of one control sphere.
 
     Attributes:
-        index: in the list of control spheres.
+        index: its index in the list of control spheres.
         expected: number of images that should show it.
         measured: number of images in which it was measured.
         radial_error_mm: mean over its outlines; None if it was not measured.
         reprojection_error_px: mean over its outlines.
-        displacement_mm: from where scan and registration put it to where the images see it; None below three images.
-        displacement_sigma_mm: of the displacement, as far as the outlines determine it.
-        finding: what is wrong, and what to do; "" if nothing is.
+        displacement_mm: distance from where scan and registration put it to where the images see it; None below three
+            images.
+        displacement_sigma_mm: standard deviation of the displacement, as far as the outlines determine it.
+        finding: the fault, and the remedy; "" if there is none.
     """
 
     index: int
@@ -67,10 +68,10 @@ class ControlEvaluation:
     """The evaluation by control spheres: the paper's means, and each sphere by itself.
 
     Attributes:
-        means: over all outlines; None if no control sphere was measured.
+        means: the mean errors over all outlines; None if no control sphere was measured.
         spheres: every control sphere that some image should show.
-        outlines: of each image, with those found by the search around the expected places.
-        assignments: of each image, outline → control sphere.
+        outlines: outlines of each image, with those found by the search around the expected places.
+        assignments: outline → control sphere of each image.
         located: the control spheres that at least two images locate, scan frame.
     """
 
@@ -97,7 +98,7 @@ class ControlEvaluation:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What is wrong with control spheres, in words."""
+        """The texts of what is wrong with control spheres."""
         return tuple(s.finding for s in self.spheres if s.finding)
 
     def measures(self) -> dict[str, float]:
@@ -126,10 +127,12 @@ def evaluate_controls(
     Args:
         outlines: per image, as the registration had them.
         taken: per image, outlines that are registration spheres.
-        images: with T_scan_camera, metric; NaN for images without a pose, which count as if they were not there.
+        images: the images with T_scan_camera, metric; NaN for images without a pose, which count as if they were not
+            there.
         spheres: registration and control spheres, scan frame.
-        captures: of each image; of a capture in which control spheres are not seen, none is expected. None: all one.
-        search: searches images for the outlines that lack; None: only `outlines` count.
+        captures: (N,) capture of each image; of a capture in which control spheres are not seen, none is expected.
+            None: all one.
+        search: searches images for the outlines that are missing; None: only `outlines` count.
     """
     posed = np.flatnonzero(np.isfinite(images.poses).all(axis=(1, 2)))
     capture = np.zeros(len(images.poses), dtype=np.int64) if captures is None else np.asarray(captures)
@@ -252,7 +255,7 @@ def _lacking(
     images: PosedImages,
     spheres: ScanSpheres,
 ) -> list[tuple[int, list[tuple[Cone, float]]]]:
-    """Where to search for the outlines that lack, by image: near a place that is known, else wide."""
+    """Return where to search for the missing outlines, by image: near a place that is known, else wide."""
     first = len(spheres.centres_m)
     wanted: dict[int, list[tuple[Cone, float]]] = {}
     for s, mine in expected.items():
@@ -280,7 +283,7 @@ WINDOW_M = 0.05  # from its expected place: a sphere that is further away counts
 
 @dataclass(frozen=True, slots=True)
 class SeenPlace:
-    """Where images see a sphere, scan frame, and image → outline of those that do."""
+    """The place at which images see a sphere, scan frame, and image → outline of those that do."""
 
     centre_m: Array
     outlines: dict[int, int]
@@ -297,7 +300,7 @@ class _Rays:
     half: Array  # (K,)
 
     def meeting(self, places: Array, radius_m: float) -> tuple[NDArray[np.bool_], Array]:
-        """Whether rays (K,) show a sphere at places (P, 3), as (P, K), and their distance from it in radii."""
+        """Return whether rays (K,) show a sphere at places (P, 3), as (P, K), and their distance from it in radii."""
         to = places[:, None, :] - self.origin[None]
         distance = np.maximum(np.linalg.norm(to, axis=2), 2 * radius_m)
         half = np.arcsin(radius_m / distance)

@@ -217,7 +217,7 @@ class Observation:
 
     @property
     def verdict(self) -> str:
-        """Whether the stated covariances agree with the observation, in words."""
+        """The text that says whether the given covariances agree with the observation."""
         low, high = HONEST
         if self.normalised_chi2 > high:
             factor = float(np.sqrt(self.normalised_chi2))

@@ -115,7 +115,7 @@ class BlockedSamples:
 
 
 def _overlap(places: Array, runs: int) -> bool:
-    """Whether boxes around so many runs of consecutive places (N, 3) overlap as those of an order in space do not."""
+    """Return whether boxes around runs of consecutive places (N, 3) overlap more than in an order by space."""
     whole = np.ptp(places, axis=0)
     thickness = 0.01 * float(whole.max())  # at least; a plane has none
     boxes = [np.prod(np.ptp(run, axis=0) + thickness) for run in np.array_split(places, runs)]
@@ -250,14 +250,14 @@ class Direction:
 
     Attributes:
         n: samples whose distances were measured, MOST_COMPARED at most.
-        excluded: of these, those farther than the outlier limit; in no mean, but in the denominator of `within`.
+        excluded: number of these farther than the outlier limit; in no mean, but in the denominator of `within`.
         mean_m: mean distance to the nearest sample of the other surface: the paper's figure.
-        median_m, p95_m: of the same distances.
-        within: for each threshold, the share of all samples that have the other surface within it.
+        median_m, p95_m: median and 95th percentile of the same distances.
+        within: share of all samples that have the other surface within each threshold.
         floor_m: mean distance from a random place of the other surface to its own nearest sample: what `mean_m`
             would be if the surfaces were equal.
-        surface_mean_m, surface_rms_m: of the distances to the other's faces (exact, of `CHECKED` samples at most);
-            None if the other is a cloud, or if they were not asked for.
+        surface_mean_m, surface_rms_m: mean and root mean square of the distances to the other's faces (exact, of
+            `CHECKED` samples at most); None if the other is a cloud, or if they were not asked for.
         normal_consistency: mean |cosine| between the normals of a sample and its nearest; None without normals.
     """
 
@@ -288,7 +288,7 @@ class ChamferScore:
     Attributes:
         pred_to_gt: accuracy: from the surface judged to the truth.
         gt_to_pred: completeness: from the truth to the surface judged.
-        thresholds_m: of the F-score.
+        thresholds_m: distance thresholds of the F-score.
         pred, gt: the samples with their distances.
         vertex_distance_m: (V,) from the vertices of the surface judged to the samples of the truth, infinite beyond
             the limit; None if not asked for.
@@ -308,7 +308,7 @@ class ChamferScore:
 
     @property
     def floor_m(self) -> float:
-        """What `chamfer_m` would be, by the sampling alone, if the surfaces were equal."""
+        """The `chamfer_m` that the sampling alone would give if the surfaces were equal."""
         return 0.5 * (self.pred_to_gt.floor_m + self.gt_to_pred.floor_m)
 
     @property
@@ -381,7 +381,7 @@ def _mean(nearest: NearestOfBlocks) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """From samples of one surface to the nearest of all samples of another."""
+    """The samples of one surface with the nearest of all samples of another."""
 
     source: Surface
     samples: Samples

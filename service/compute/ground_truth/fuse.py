@@ -54,11 +54,11 @@ _STIFF = (
 
 @dataclass(frozen=True, slots=True)
 class FieldLengths:
-    """How smooth the field is.
+    """The lengths that make the field smooth.
 
     Attributes:
-        smoothing_m: over which the field averages the scan's noise.
-        reach_m: over which it decays where the scan shows nothing.
+        smoothing_m: length over which the field averages the scan's noise.
+        reach_m: length over which it decays where the scan shows nothing.
     """
 
     smoothing_m: float = 0.0007
@@ -68,7 +68,7 @@ class FieldLengths:
 def _deviation_field(
     surface: Surface, links: csr_matrix, known_m: Array, known: Mask, lengths: FieldLengths
 ) -> Array:
-    """(V,) metres: follows `known_m` where it is `known`, and decays from there along the surface.
+    """Return (V,) metres that follow `known_m` where it is `known`, and decay from there along the surface.
 
     It minimises the squared differences over the edges, with weights towards the known values and, elsewhere, 0.
 
@@ -77,7 +77,7 @@ def _deviation_field(
         links: its `_adjacency`.
         known_m: (V,) deviations, along the normals.
         known: (V,) where they count.
-        lengths: of smoothing and decay.
+        lengths: the lengths of smoothing and decay.
 
     Raises:
         ComputeError: the solver does not converge.
@@ -205,7 +205,7 @@ _VERTICES = 200_000  # computed at a time, which limits the memory
 
 
 class Source(IntEnum):
-    """Where a vertex comes from."""
+    """The origin of a vertex."""
 
     CT = 0
     SCAN = 1
@@ -214,16 +214,16 @@ class Source(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
-    """How two meshes are fused.
+    """The settings of the fusion of two meshes.
 
     Attributes:
         blend_m: width of the overlap over which the weight rises.
         sigma_ct_m, sigma_scan_m: least standard deviation of each surface along its normal, as of its spheres.
         alignment_covariance: (6, 6) of T_scan_ct as in `evaluation.closure.Alignment`; None: known exactly.
-        keep_scan_only: whether parts of the scan that the CT lacks are added, unconnected.
+        keep_scan_only: true to add parts of the scan that are missing in the CT, unconnected.
         least_part_m2: smaller unconnected parts of the CT are left out.
         overlap, wound: limits.
-        lengths: of the field by which the CT follows the scan.
+        lengths: lengths of the field by which the CT follows the scan.
     """
 
     blend_m: float = 0.003
@@ -242,15 +242,15 @@ class Fused:
     """The ground truth.
 
     Attributes:
-        surface: in the frame of the sources.
-        source: (V,) of Source.
-        weight: (V,) of the scan, 0 to 1.
+        surface: the fused mesh, in the frame of the sources.
+        source: (V,) the Source of each vertex.
+        weight: (V,) weight of the scan, 0 to 1.
         sigma_m: (V,) standard deviation along the normal.
         wound: (V,) in the wound region, as proposed and corrected.
         ct_offset_m: median height of the CT above the scan, outside the wound: its bias if the scan is right.
         ct_spread_m: robust standard deviation of the same heights.
-        folded: faces that could not be kept from turning over when their vertices moved.
-        corrections: that were applied.
+        folded: number of faces that could not be prevented from turning over when their vertices moved.
+        corrections: the corrections that were applied.
     """
 
     surface: Surface
@@ -279,12 +279,12 @@ def fuse(
     """Fuse a CT mesh and a scan.
 
     Args:
-        ct: in the scan's frame, vertices shared between faces, outward faces.
-        scan: where it has holes, and in the wound, the CT is taken.
+        ct: the CT's mesh in the scan's frame, vertices shared between faces, outward faces.
+        scan: the scan's mesh; where it has holes, and in the wound, the CT is taken.
         up: (3,) direction away from the table; it distinguishes hollows from undersides.
         settings: the defaults if None.
         corrections: regions that people drew.
-        removed: where the CT shows something that was taken away before the scan; there only the scan counts.
+        removed: region where the CT shows something that was taken away before the scan; there only the scan counts.
 
     Raises:
         ComputeError: a source has no faces, or the two agree nowhere.
@@ -391,7 +391,7 @@ class _Addition:
 
 
 def _with_scan_only(fused: Fused, carrier: Surface, addition: _Addition) -> Fused:
-    """Add the faces of the scan that the CT lacks, as separate parts."""
+    """Add the faces of the scan missing in the CT, as separate parts."""
     scan, settings = addition.scan, addition.settings
     extra, _ = compact(scan.vertices_m, scan.faces[addition.taken(carrier)])
     n = len(extra.vertices_m)
@@ -418,12 +418,12 @@ class Markers:
     """Spheres on posts, in the frame of the mesh.
 
     Attributes:
-        centres_m: (M, 3).
-        radius_m: of the spheres.
+        centres_m: (M, 3) the spheres' centres.
+        radius_m: radius of the spheres.
         up: (3,) along the posts, away from the table.
-        post_radius_m: of the posts; 0: there are none.
-        post_length_m: below the centres.
-        margin_m: cut around both.
+        post_radius_m: radius of the posts; 0: there are none.
+        post_length_m: length of the posts below the centres.
+        margin_m: width that is cut away around both.
     """
 
     centres_m: Array

@@ -86,13 +86,13 @@ def heat_picture(
     names: tuple[str, str] = ("prediction", "truth"),
     more: Sequence[Panel] = (),
 ) -> Pixels:
-    """A picture of two surfaces by their distances, seen along one direction.
+    """Draw two surfaces coloured by their distances, seen along one direction.
 
     Args:
         pred, gt: the surfaces.
         score: their distances.
-        scale: of the colours.
-        names: of the two, for the titles.
+        scale: the scale of the colours.
+        names: the names of both surfaces, for the titles.
         more: further views of the same scene, beside them.
 
     Returns:
@@ -241,10 +241,10 @@ def write_heat_mesh(
     """Write a surface with, at each vertex, its distance in millimetres (`distance_mm`) and the colour of that.
 
     Args:
-        path: of the file.
+        path: the file to write.
         surface: metres.
         distance_m: (V,); what lies beyond the limit of the scale may be infinite, and is written as the limit.
-        scale: of the colours.
+        scale: the scale of the colours.
         metres_per_unit: unit of the file's coordinates, so that it lies over the file that was judged.
         comments: further lines for the header, in ASCII.
     """
@@ -260,13 +260,13 @@ _WORDS = {Source.CT: "CT orange", Source.SCAN: "scan blue", Source.BLEND: "blend
 
 
 def fusion_picture(ct: Surface, scan: Surface, score: ChamferScore, scale: HeatScale, fused: Fused) -> bytes:
-    """A PNG with CT and scan by their distances, and the fused mesh by its sources, seen along one direction.
+    """Draw a PNG with CT and scan by their distances, and the fused mesh by its sources, seen along one direction.
 
     Args:
         ct, scan: as they were compared, in one frame.
-        score: of the comparison.
-        scale: of its colours.
-        fused: of both.
+        score: the result of the comparison.
+        scale: the scale of its colours.
+        fused: the fusion of both.
     """
     palette = np.array([_COLOURS[source] for source in Source], dtype=np.uint8)
     title = "source: " + ", ".join(f"{_WORDS[s]} {100 * fused.share(s):.0f} %" for s in Source)

@@ -40,12 +40,12 @@ class OverlapLimits:
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """For each vertex of the CT (V,): the nearest place of the scan (V, 3), and whether the scan is good there.
+    """The nearest place of the scan (V, 3) for each vertex of the CT (V,), and whether the scan is good there.
 
     Attributes:
-        nearest_m: (V, 3).
+        nearest_m: (V, 3) nearest places of the scan.
         offset_m: (V,) height of the CT above the scan there, along the CT's outward normal.
-        covered: (V,).
+        covered: (V,) true where the scan is good.
     """
 
     nearest_m: Array = field(repr=False)
@@ -112,11 +112,11 @@ class _FacesAround:
 
 @dataclass(frozen=True, slots=True)
 class WoundLimits:
-    """What counts as a wound.
+    """The limits by which a part of the surface counts as a wound.
 
     Attributes:
         closing_m: uncovered places nearer than twice this to one another are one, with what lies between.
-        least_area_m2: of the surface.
+        least_area_m2: least area of its surface.
         least_depth_m: mean depth below the rim.
         least_facing: mean cosine between its normals and up, so that undersides and sides are none.
     """
@@ -128,7 +128,7 @@ class WoundLimits:
 
 
 def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | None = None) -> Mask:
-    """(V,) vertices of the CT in hollows that open upwards and that the scan lacks; all False if there are none.
+    """Return (V,) vertices of the CT in hollows open upwards that the scan misses; all False if there are none.
 
     Args:
         ct: the CT's mesh.
@@ -300,9 +300,9 @@ class RegionCorrection:
     """A region in which a person has chosen CT or scan.
 
     Attributes:
-        region: where.
+        region: the region.
         from_ct: True: the CT is taken there; False: the scan, wherever it has surface.
-        by: who drew it.
+        by: the person who drew it.
     """
 
     region: Region
@@ -319,11 +319,11 @@ def corrected(proposed: Mask, points_m: Array, corrections: Sequence[RegionCorre
 
 
 def seen_along(corners_m: Array, along: Array, depth_m: tuple[float, float]) -> Prism:
-    """A polygon with corners (K, 3) in space, as seen along a direction (3,), extended along it.
+    """Build the prism over a polygon with corners (K, 3) in space, as seen along a direction (3,), extended along it.
 
     Args:
-        corners_m: in order around the polygon.
-        along: from the surface towards the viewer.
+        corners_m: (K, 3) corners in order around the polygon.
+        along: (3,) direction from the surface towards the viewer.
         depth_m: how far it reaches below the lowest corner (negative) and above the highest one.
 
     Raises:

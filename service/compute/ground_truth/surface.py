@@ -33,7 +33,7 @@ class Surface:
 
     @property
     def is_mesh(self) -> bool:
-        """Whether there are faces."""
+        """True if the surface has faces."""
         return len(self.faces) > 0
 
     @cached_property
@@ -128,10 +128,10 @@ def write_ply(
     """Write a surface.
 
     Args:
-        path: of the file.
+        path: the file to write.
         surface: metres.
         metres_per_unit: unit of the file's coordinates.
-        properties: for each name (V,) numbers: fractional ones are written as float, others as unsigned bytes.
+        properties: (V,) numbers for each name: fractional ones are written as float, others as unsigned bytes.
         comments: lines for the header, in ASCII.
     """
     columns = {name: surface.vertices_m[:, k] / metres_per_unit for k, name in enumerate("xyz")}
@@ -144,11 +144,11 @@ def write_ply(
 def ply_bytes(
     columns: Mapping[str, NDArray[np.generic]], faces: NDArray[np.integer], comments: Sequence[str] = ()
 ) -> bytes:
-    """A binary, little-endian PLY.
+    """Encode a binary, little-endian PLY.
 
     Args:
-        columns: for each property of the vertices, x, y and z first, (V,) float32, float64 or uint8.
-        faces: (F, 3).
+        columns: (V,) float32, float64 or uint8 for each property of the vertices, x, y and z first.
+        faces: (F, 3) indices of vertices.
         comments: lines for the header, in ASCII.
     """
     return b"".join(_ply_blocks(columns, faces, comments))

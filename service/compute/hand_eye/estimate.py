@@ -104,8 +104,8 @@ class CorrectedHandEye(HandEyeAnswer):
 
     Attributes:
         correction: the arm's systematic error.
-        terms: which of its parameters were estimated.
-        size: of the board, by the lengths of the corrected arm.
+        terms: the parameters that were estimated.
+        size: the board's size by the lengths of the corrected arm.
     """
 
     correction: ArmCorrection
@@ -127,14 +127,14 @@ class HandEyeResult(HandEyeAnswer):
         rotation_spread_deg: largest rotation between two views.
         second_axis_deg: root mean square rotation about the second best axis.
         condition: condition number of the translation's linear system; infinite for a single rotation axis.
-        turned: (N,) whether the view's board pose was rotated by half a turn.
+        turned: (N,) true if the view's board pose was rotated by half a turn.
         excluded: reason by index of each view that no fit used.
         corrected: the answer with the arm's systematic error estimated; None if no joints were given or if it does
             not lower the held-out error.
         arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
             reported).
-        size: of the board, by the robot's lengths.
-        findings: what the measurements contradict, in words; empty if nothing.
+        size: the board's size by the robot's lengths.
+        findings: texts of what the measurements contradict; empty if nothing.
     """
 
     method: Method
@@ -167,10 +167,10 @@ class HandEyeViews:
         T_base_flange: (N, 4, 4) from the robot.
         T_camera_board: (N, 4, 4) from the images.
         corners: the boards' corners, from which the board poses' covariance follows; required by `reprojection`.
-        joints_rad: (N, J) as recorded with the poses.
+        joints_rad: (N, J) joints as recorded with the poses.
         arm: the arm's model, with `joints_rad`.
-        board: as described, with the tolerance of its size; None: its size is exactly known.
-        poses: how else the file of the robot's poses could be read; None if they come from the robot itself.
+        board: the board as described, with the tolerance of its size; None: its size is exactly known.
+        poses: the other ways to read the file of the robot's poses; None if they come from the robot itself.
     """
 
     T_base_flange: Array
@@ -206,9 +206,9 @@ def calibrate_hand_eye(
         setup: eye-to-hand: the camera stands beside the robot and the board is on the flange. T_base_camera and
             T_flange_board then take the places of T_flange_camera and T_base_board in the answer, and the arm's
             systematic error is not estimated.
-        camera_covariance: of the calibrated camera; with corners, it is added to the answer's covariance.
+        camera_covariance: covariance of the calibrated camera; with corners, it is added to the answer's covariance.
         bootstrap: number of resamples.
-        seed: of the resampling and of the folds.
+        seed: seed of the resampling and of the folds.
 
     Raises:
         DataError: array shapes do not match, values are not finite, or the joints are another arm's.

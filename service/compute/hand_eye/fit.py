@@ -71,12 +71,12 @@ class HandEyeSolution:
     Attributes:
         T_flange_camera: the calibration.
         T_base_board: the board's pose.
-        scale: of the board, its true size over the stated one.
+        scale: the board's true size over the given one.
         scale_sigma: standard deviation of `scale`, by the noise model.
         views: the views with the arm parameters in use; weighted fit only.
         noise: weighted fit only.
         fit: weighted fit only.
-        correction: of the arm, if it was estimated.
+        correction: the arm's correction, if it was estimated.
     """
 
     T_flange_camera: Transform
@@ -212,10 +212,10 @@ def turned_back(data: HandEyeMeasurements, answer: HandEyeSolution, T_board_turn
 
 
 def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution | None = None) -> HandEyeSolution:
-    """One method's answer from these views, without a model of the arm's error.
+    """Solve these views with one method, without a model of the arm's error.
 
     Args:
-        data: without outliers.
+        data: the measurements without outliers.
         method: the method.
         start: a nearby answer, which saves the search for a start.
 
@@ -227,9 +227,9 @@ def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution
 
 
 def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution, scale: float) -> HandEyeSolution:
-    """An unweighted method's answer for a board that is `scale` times as large as stated.
+    """Solve with an unweighted method for a board that is `scale` times as large as given.
 
-    These methods have no noise by which the stated size could be weighed against the views: the weighted fit tells
+    These methods have no noise by which the given size could be weighed against the views: the weighted fit gives
     them the scale.
 
     Raises:
@@ -247,11 +247,11 @@ def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution
 
 
 def without_size(data: HandEyeMeasurements, answer: HandEyeSolution | None = None) -> HandEyeSolution:
-    """The weighted fit's answer if nothing were known of the board's size.
+    """Return the weighted fit's answer if nothing were known of the board's size.
 
     Args:
-        data: without outliers.
-        answer: with the arm's errors, whose noise is then kept; None: without them.
+        data: the measurements without outliers.
+        answer: an answer with the arm's errors, whose noise is then used; None: without them.
 
     Raises:
         ComputeError: the views do not determine the answer.
@@ -307,10 +307,10 @@ def _near(answer: HandEyeSolution | RobustStart) -> Fit:
 
 
 def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms, start: Noise) -> HandEyeSolution:
-    """The weighted answer with the arm's systematic error estimated.
+    """Return the weighted answer with the arm's systematic error estimated.
 
     Args:
-        data: without outliers, with joints and arm.
+        data: the measurements without outliers, with joints and arm.
         plain: the weighted answer without it.
         terms: the arm parameters to estimate.
         start: noise from `arm_noise`, of these views or nearly the same.
@@ -364,7 +364,7 @@ def arm_outliers(answer: HandEyeSolution) -> NDArray[np.bool_]:
 
 
 def arm_is_possible(data: HandEyeMeasurements) -> bool:
-    """Whether joints are known and there are enough views to estimate the arm's errors."""
+    """Return whether joints are known and there are enough views to estimate the arm's errors."""
     return data.arm is not None and data.joints_rad is not None and len(data.hands) >= _MIN_ARM_VIEWS
 
 
@@ -377,12 +377,12 @@ def held_out(
     folds: NDArray[np.int64],
     point_m: Array,
 ) -> tuple[Array, Array]:
-    """(N,) distance in mm and angle in degrees of each view's board from a fit without this view.
+    """Return (N,) distance in mm and angle in degrees of each view's board from a fit without this view.
 
     Args:
         data: all views, including outliers (which no fit uses).
         keep: (N,) whether a view is not an outlier.
-        method: of the fits.
+        method: the method of the fits.
         terms: arm parameters in the fits.
         start: the answer from all views without the arm's errors, and the noise with them, to start from.
         folds: (N,) fold of each view.

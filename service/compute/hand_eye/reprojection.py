@@ -113,13 +113,13 @@ def _step(gram: Array) -> Array:
 def solve_reprojection(
     hands: Array, corners: BoardCorners, X: Transform, B: Transform
 ) -> tuple[Transform, Transform]:
-    """T_flange_camera and T_base_board of least reprojection error, with the robot's poses fixed.
+    """Minimise the reprojection error over T_flange_camera and T_base_board, with the robot's poses fixed.
 
     The paper's method, by Gauss–Newton. It attributes the robot's errors, which are many times larger, to the images.
 
     Args:
         hands: (N, 4, 4) T_base_flange.
-        corners: of the N views.
+        corners: the board's corners in the N views.
         X: initial T_flange_camera.
         B: initial T_base_board.
 

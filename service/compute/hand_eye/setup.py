@@ -107,7 +107,7 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
     """Correct the views whose board corners were numbered from the other end, so that all views agree with the robot.
 
     Between two views, flange and camera must rotate by the same angle. Which orientation fits each pair better gives
-    a signed graph; its leading eigenvector splits the views into two groups, and the larger one is kept as it is.
+    a signed graph; its leading eigenvector splits the views into two groups, and the larger one stays as it is.
     """
     n = len(hands)
     turned = boards @ T_board_turned
@@ -250,8 +250,8 @@ class PoseReading:
 
     Attributes:
         hands: (N, 4, 4) T_base_flange of the views.
-        words: what the poses are then, after "they fit".
-        remedy: what to do.
+        words: text that says which poses they are then, after "they fit".
+        remedy: the advice to the user.
     """
 
     hands: Array
@@ -294,11 +294,11 @@ class SetupFit:
 
     @property
     def fits(self) -> bool:
-        """Whether the errors are small enough for a robot."""
+        """True if the errors are small enough for a robot."""
         return self.mm <= _MOST_MM and self.deg <= _MOST_DEG
 
     def beats(self, other: SetupFit) -> bool:
-        """Whether it fits, and so much better that the other reading must be a mistake."""
+        """Return whether it fits, and so much better that the other reading must be a mistake."""
         return self.fits and _CLEARLY * self.mm < other.mm and _CLEARLY * self.deg < other.deg
 
     @property

@@ -50,7 +50,7 @@ def bootstrap_covariance(
 
 
 def bootstrap_picks(n: int, count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Up to `count` draws of n views with replacement; draws of too few different views are left out."""
+    """Draw up to `count` times n views with replacement; draws of too few different views are left out."""
     picks = [rng.integers(0, n, n) for _ in range(count)]
     return [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
 
@@ -146,11 +146,11 @@ class BoardSizeFound:
     """The board's true size over the stated one, as the robot's lengths show it.
 
     Attributes:
-        ratio: by robot and images alone.
+        ratio: the ratio by robot and images alone.
         sigma: standard deviation of `ratio`, without that of the robot's own lengths.
-        tolerance: stated for the board: the largest relative error of its size.
-        used: in the answer: `ratio` and the stated size, weighted.
-        square_m: the stated side of a square; None if none was stated.
+        tolerance: the board's given tolerance: the largest relative error of its size.
+        used: the ratio used in the answer: `ratio` and the given size, weighted.
+        square_m: the given side of a square; None if none was given.
     """
 
     ratio: float
@@ -161,7 +161,7 @@ class BoardSizeFound:
 
     @property
     def credible(self) -> bool:
-        """Whether the difference lies within tolerance, uncertainty and the arm's own lengths."""
+        """True if the difference lies within tolerance, uncertainty and the arm's own lengths."""
         return abs(self.ratio - 1) <= _SURE * float(np.hypot(self.sigma, _RULER)) + self.tolerance
 
     @property
@@ -203,12 +203,12 @@ def size_sigma(tolerance: float) -> float:
 
 
 def size_found(free: HandEyeSolution, used: float, board: Board | None, counts: Array) -> BoardSizeFound:
-    """The board's size by robot and images alone.
+    """Compute the board's size by robot and images alone.
 
     Args:
         free: answer of the weighted fit that knows nothing of the board's size.
-        used: the board's scale in the answer that weighs the stated size too.
-        board: as described; None: its size is exactly known.
+        used: the board's scale in the answer that weighs the given size too.
+        board: the board as described; None: its size is exactly known.
         counts: (R, N) how often each view counts in each replicate of a bootstrap.
     """
     assert free.views is not None
@@ -220,7 +220,7 @@ def size_found(free: HandEyeSolution, used: float, board: Board | None, counts: 
 
 
 def contradictions(data: HandEyeMeasurements, answer: HandEyeSolution) -> tuple[str, ...]:
-    """What robot and images say differently, in words, though they agree on the board's size.
+    """Describe how robot and images contradict each other, though they agree on the board's size.
 
     An arm errs by its joints' angles, so its positions err by no more than its rotations do at the length of the arm.
     Positions that scatter more than that contradict the images in another way.

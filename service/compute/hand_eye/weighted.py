@@ -213,13 +213,13 @@ def start_at(X: Transform, B: Transform, scale: float, count: int = 0) -> Fit:
 
 
 def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITERATIONS) -> Fit:
-    """Gauss–Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
+    """Solve the least squares weighted by `noise` with Gauss–Newton, in increments scaled by the normal matrix.
 
     Args:
         views: the measurements.
         noise: standard deviations from `estimate_noise`.
-        start: from which transforms and scale to start.
-        iterations: largest number.
+        start: the initial transforms and scale.
+        iterations: largest number of iterations.
 
     Raises:
         ComputeError: the views do not determine the answer.
@@ -251,10 +251,10 @@ def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITE
 
 
 def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
-    """Standard deviations that maximise the restricted likelihood, linearised near the answer.
+    """Estimate the standard deviations that maximise the restricted likelihood, linearised near the answer.
 
     Args:
-        views: without outliers.
+        views: the measurements without outliers.
         near: the answer, approximately.
         start: initial values, with one scale for each kind of arm parameter.
         floor_m: smallest robot noise; the same number in radians for the rotation.
@@ -303,15 +303,16 @@ def _noise(logs: Array) -> Noise:
 
 
 def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np.int64]) -> Noise:
-    """A prior scale for each group of arm parameters; those that the data do not need go to zero.
+    """Estimate a prior scale for each group of arm parameters; those that the data do not need go to zero.
 
     Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe, then
     MacKay's fixed point, which is fast. A gear errs at one or two of its harmonics, not at all of them. Once these
-    are found, they can be told from the other joints' errors, and hold beyond the joint angles that were visited.
+    are found, they can be separated from the other joints' errors, and hold beyond the joint angles that were
+    visited.
 
     Args:
-        views: as for `solve`.
-        noise: with the initial scales, in the groups of `views.kind`.
+        views: the same as in `solve`.
+        noise: noise with the initial scales, in the groups of `views.kind`.
         near: the answer, approximately.
         groups: (K,) group of each parameter.
 

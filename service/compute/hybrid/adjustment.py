@@ -36,8 +36,8 @@ class BundleSolution:
     """The adjusted state.
 
     Attributes:
-        state: cameras, points, bases, camera.
-        sigmas: of the components, estimated.
+        state: the adjusted cameras, points, bases and camera model.
+        sigmas: the estimated sigmas of the components.
         weights: robust weight of each measurement, by component.
         covariance: (n, n) of the frame parameters, points eliminated.
         chi2: reduced chi square of each component, with robust weights and its own redundancy.

@@ -91,7 +91,8 @@ class HybridOptions:
             given.
         common_errors: prior sizes of the errors that all outlines share, which are estimated; None:
             `EXPECTED_COMMON_ERRORS`.
-        most_observations: of tracks used; more gain almost nothing and cost time and memory.
+        most_observations: largest number of observations of tracks used; more gain almost nothing and cost time and
+            memory.
         robot_sigma_m: initial sigma of the robot's positions; estimated from the data.
         robot_sigma_rad: initial sigma of its orientations; estimated from the data.
         track_sigma_px: initial sigma of the tracks; estimated from the data.
@@ -116,20 +117,21 @@ class HybridPoses:
     covariances are exp(w) R, t + d in the axes of the outer frame, metres and radians.
 
     Attributes:
-        T_scan_camera: (N, 4, 4).
-        T_world_camera: (N, 4, 4).
+        T_scan_camera: (N, 4, 4) camera poses in the scan frame.
+        T_world_camera: (N, 4, 4) camera poses in the world frame.
         T_world_scan: the registration.
-        T_world_group: base of each group.
+        T_world_group: the base of each group.
         points_scan: (P, 3) scene points used.
         covariance: (6 (N + G), 6 (N + G)) joint, of every image's T_scan_camera, then of every group's T_scan_base.
         camera_share: part of it due to the camera's own uncertainty; zero if that was not given.
-        camera: as given, or refined.
-        sigma_track_px: of one observation of a track.
-        sphere_factor: of the outlines' residuals over their own sigmas.
-        sigma_robot_m, sigma_robot_rad: of the robot's poses per axis, including systematic errors; None without a
-            robot.
+        camera: the camera as given, or refined.
+        sigma_track_px: standard deviation of one observation of a track.
+        sphere_factor: ratio of the outlines' residuals to their own sigmas.
+        sigma_robot_m, sigma_robot_rad: standard deviations of the robot's poses per axis, including systematic
+            errors; None without a robot.
         chi2: reduced chi square of each component: tracks, spheres, centres, robot_position, robot_rotation, lens.
-        registration: of the scan to the poses of structure from motion, from which the adjustment started.
+        registration: the registration of the scan to the poses of structure from motion, from which the adjustment
+            started.
         centre_scan_m: (3,) mean of the spheres.
     """
 
@@ -215,13 +217,13 @@ def hybrid_poses(
     """Adjust tracks, spheres and robot poses together.
 
     Args:
-        images: with poses from structure from motion, in any frame and scale, and the camera with which the outlines
-            were made. Their stations are those of the robot.
-        tracks: of the same model.
+        images: the images with poses from structure from motion, in any frame and scale, and the camera with which the
+            outlines were made. Their stations are those of the robot.
+        tracks: tracks of the same model.
         outlines: per image, from the detector.
         spheres: the registration spheres; without a covariance, options.sphere_sigma_m.
-        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in its station's base frame; NaN
-            for images without a robot pose. None: only the spheres give the metric frame.
+        T_base_camera: (N, 4, 4) poses by the robot and the hand-eye calibration, each in its station's base frame;
+            NaN for images without a robot pose. None: only the spheres give the metric frame.
         known_camera: covariance of a fixed camera, which is propagated to the poses. None: taken as exact.
         options: settings.
 

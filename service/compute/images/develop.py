@@ -44,19 +44,19 @@ class Crop:
 
 @dataclass(frozen=True, slots=True)
 class Development:
-    """What is recorded of a development.
+    """The record of a development.
 
     Attributes:
-        parameters: fixed ones.
+        parameters: the fixed parameters.
         white_balance: gains of red, green, blue and second green that the camera recorded (0: as the first green).
-        black_level: of the four photosites of the pattern.
-        white_level: of the sensor's values.
+        black_level: black level of the four photosites of the pattern.
+        white_level: white level of the sensor's values.
         area: width and height of the exposed area.
-        crop: of the picture in it.
+        crop: the picture's crop in it.
         shift_px: median shift of the picture against the JPEG in x and y; None without a JPEG.
-        largest_shift_px: of a part of the picture; None without a JPEG.
-        rawpy: its version.
-        libraw: its version.
+        largest_shift_px: largest shift of a part of the picture; None without a JPEG.
+        rawpy: rawpy's version.
+        libraw: LibRaw's version.
     """
 
     parameters: DevelopParameters
@@ -269,7 +269,7 @@ class Shift:
     """The shift of a second picture's content against the first, in x and y, over the parts that show one.
 
     Attributes:
-        median_px: of all parts; what is at p in the first is at p + shift in the second.
+        median_px: median over all parts; what is at p in the first is at p + shift in the second.
         largest_px: length of the largest shift of a part.
         parts: number of parts that show a shift.
     """
@@ -280,7 +280,7 @@ class Shift:
 
     @property
     def certain(self) -> bool:
-        """Whether enough parts show a shift."""
+        """True if enough parts show a shift."""
         return self.parts >= _FEWEST
 
 

@@ -35,10 +35,10 @@ _REMEDY = "Copy the file from the camera again, and use JPEG or PNG images"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as stored, after checking that it is complete; a JPEG is not decoded.
+    """Return width and height of an image as stored, after checking that it is complete; a JPEG is not decoded.
 
     Raises:
-        DataError: as `read_image`.
+        DataError: the file is missing, truncated or not a decodable image.
     """
     data = _checked(path)
     if data.startswith(JPEG_BEGINS):
@@ -80,10 +80,10 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """(H, W) brightness as stored (a JPEG's luma, at full resolution), in a third of the memory of `read_image`.
+    """Read the (H, W) brightness as stored (a JPEG's luma, at full resolution), in a third of `read_image`'s memory.
 
     Raises:
-        DataError: as `read_image`.
+        DataError: the file is missing, truncated or not a decodable image.
     """
     return _decode(path, cv2.IMREAD_GRAYSCALE)
 
@@ -97,10 +97,10 @@ def _decoded(data: bytes, path: Path, how: int) -> NDArray[np.uint8]:
 
 
 def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
-    """`read_image` for an image of the camera's size.
+    """Read an image of the camera's size with `read_image`.
 
     Raises:
-        DataError: as `read_image`, or the image has another size.
+        DataError: the file is missing, truncated or not a decodable image, or the image has another size.
     """
     image = read_image(path)
     if image.shape[:2] != (camera.height, camera.width):
@@ -114,12 +114,12 @@ def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
 
 
 def read_reduced(path: Path, camera: CameraModel, least_width: int) -> tuple[NDArray[np.uint8], CameraModel]:
-    """The image reduced to a half, a quarter or an eighth, at least `least_width` wide, and its camera.
+    """Read the image reduced to a half, a quarter or an eighth, at least `least_width` wide, and its camera.
 
     A JPEG is decoded at that size, which takes a third of the time and at an eighth 1/64 of the memory.
 
     Raises:
-        DataError: as `read_image_of`.
+        DataError: the file is missing, truncated or not a decodable image, or the image has another size.
     """
     reduction = next((k for k in (8, 4, 2) if camera.width // k >= least_width), 1)
     if reduction == 1:
@@ -167,12 +167,12 @@ class ImageFolder:
 
 
 def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: bool = False) -> ImageFolder:
-    """The images of a folder, each checked to be complete, unique and of the wanted size.
+    """List the images of a folder, each checked to be complete, unique and of the wanted size.
 
     Args:
         folder: subfolders are not searched.
         size: width and height that the images must have; None: the most common size.
-        strict: whether odd files are errors too.
+        strict: true if odd files are errors too.
 
     Raises:
         DataError: the folder does not exist, has no image (of the size), or has damaged ones (all are counted); with
@@ -273,13 +273,13 @@ REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.
 
 
 def decode(content: bytes, how: int, *, name: str, remedy: str) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR or (H, W) of a picture file.
+    """Decode a picture file as (H, W, 3) BGR or (H, W).
 
     Args:
-        content: of the file, which has been checked (service.core.picture_files).
+        content: the file's content, which has been checked (service.core.picture_files).
         how: flags of cv2.imdecode.
-        name: of the file, for the error.
-        remedy: what the reader of the error should do.
+        name: the file's name, for the error.
+        remedy: advice to the reader of the error.
 
     Raises:
         DataError: OpenCV cannot decode it.
@@ -300,14 +300,14 @@ _SHOWN_REMEDY = "Download the recorded file and look at it; it is kept unchanged
 def decode_reduced(
     content: bytes, width_px: int, name: str, *, upright: bool = False
 ) -> tuple[NDArray[np.uint8], int]:
-    """A JPEG or PNG as (H, W, 3) BGR, at most `width_px` wide, and its width as stored.
+    """Decode a JPEG or PNG as (H, W, 3) BGR, at most `width_px` wide; return its width as stored too.
 
     It is decoded at an eighth, a quarter or half of its size if that is wide enough, because 60 MP take long.
 
     Args:
-        content: of the file.
+        content: the file's content.
         width_px: narrower pictures keep their width.
-        name: of the file, for messages.
+        name: the file's name, for messages.
         upright: rotate by the orientation tag; otherwise the pixels are as stored, like those that are measured.
 
     Raises:
@@ -346,7 +346,7 @@ class ImageQuality:
     Attributes:
         edge_px: median width of its clearest edges (height over steepest slope); 2 to 4 in a sharp image, NaN if it
             has none.
-        black: whether hardly any pixel is brighter than black.
+        black: true if hardly any pixel is brighter than black.
     """
 
     edge_px: float

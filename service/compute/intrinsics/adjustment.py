@@ -241,7 +241,7 @@ def adjust(
     bow_m: Array | None = None,
     iterations: int = _MAX_ITERATIONS,
 ) -> Adjustment:
-    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS, the board's bow and every pose.
+    """Adjust the camera's first `parameters` PARAMETERS, the board's bow and every pose by Levenberg-Marquardt.
 
     Corners have Huber weights.
 
@@ -251,13 +251,13 @@ def adjust(
 
     Args:
         views: (N) corners, px.
-        surface: of the board.
+        surface: the board's surface.
         size: width and height, px.
         camera: initial camera.
         poses: (N, 6) initial rvec and tvec (m).
         parameters: number estimated; the others keep their values in `camera` (zero).
         bow_m: (S,) initial bow; None: flat.
-        iterations: largest number.
+        iterations: largest number of iterations.
 
     Raises:
         ComputeError: the equations are singular, or the solution did not stay finite.
@@ -309,8 +309,8 @@ class _Linearised:
 
     Attributes:
         scale: robust scale of the corners in px by which the cost was taken.
-        present: that of the residuals here.
-        step: of the camera, by which it was reached; None at the beginning.
+        present: robust scale of the residuals here.
+        step: the camera's step by which it was reached; None at the start.
     """
 
     theta: Array

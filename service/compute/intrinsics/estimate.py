@@ -118,7 +118,7 @@ def calibrate_intrinsics(
     that fits the final camera after all is readmitted. Outlying corners within a view are downweighted (Huber).
 
     Args:
-        views: from `find_board`.
+        views: views from `find_board`.
         board: the board in the views.
         size: width and height of the images, px.
         model: pinhole (no distortion), radial2 (k1, k2), opencv4 (and p1, p2), opencv5 (and k3), rational (k1 … k6).
@@ -195,10 +195,10 @@ def bent(board: Board, bow_m: Array) -> Board:
 
 
 def leave_one_out(solution: Adjustment) -> Array:
-    """(N, P + S) change of the parameters and the bow without each view, by one Newton step at the solution.
+    """Compute the (N, P + S) change of parameters and bow without each view, by one Newton step at the solution.
 
-    Without view i, the gradient at the solution is minus this view's part, g_i, and the normal matrix lacks its part,
-    S_i: d = (S - S_i)^-1 g_i. NaN if the other views do not determine the camera.
+    Without view i, the gradient at the solution is minus this view's part, g_i, and the normal matrix is less its
+    part, S_i: d = (S - S_i)^-1 g_i. NaN if the other views do not determine the camera.
     """
     normal = np.sum([view.normal for view in solution.views], axis=0) + np.diag(solution.prior)
     scale = np.sqrt(np.diag(normal))

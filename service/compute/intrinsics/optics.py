@@ -125,7 +125,7 @@ def _same(field: str, value: object, reference: object) -> bool:
 
 
 def states_focus(optics: Sequence[Optics]) -> bool:
-    """Whether the images would reveal a change of focus; the focus mode alone does not."""
+    """Return whether the images would reveal a change of focus; the focus mode alone does not."""
     return all(one.focus_position is not None or one.focus_distance_m is not None for one in optics)
 
 

@@ -23,14 +23,14 @@ class ProjectionUncertainty:
     """Standard deviation of a projected point in its worst direction, on a grid over the image.
 
     Attributes:
-        distance_m: of the points along the optical axis.
+        distance_m: distance of the points along the optical axis.
         pixels: (rows, columns, 2) positions of the grid.
-        sigma_px: (rows, columns).
+        sigma_px: (rows, columns) standard deviation.
         sigma_mm: (rows, columns) the same at that distance, perpendicular to the line of sight.
-        centre_px: at the middle of the image.
+        centre_px: standard deviation at the middle of the image.
         worst_px: largest over the image.
         rms_px: root mean square over the image.
-        centre_mm: at the middle of the image.
+        centre_mm: standard deviation at the middle of the image.
         worst_mm: largest over the image.
         rms_mm: root mean square over the image.
     """
@@ -52,13 +52,13 @@ class EstimatedCamera:
     """A camera as determined by board images: the input of its projection uncertainty.
 
     Attributes:
-        camera: with `len(adjustment.parameters)` estimated parameters.
+        camera: the camera with `len(adjustment.parameters)` estimated parameters.
         board: the board in the images.
         corners: (N) the board's points in each image.
         adjustment: the equations at the solution.
-        covariance: (Q, Q) of the unknowns: the parameters, then the terms of the board's bow.
+        covariance: (Q, Q) covariance of the unknowns: the parameters, then the terms of the board's bow.
         bends: (K, S) displacement along the board's normal of each of its points by these terms; S may be 0.
-        variance: of one coordinate of a corner, px².
+        variance: variance of one coordinate of a corner, px².
     """
 
     camera: CameraModel
@@ -79,7 +79,7 @@ def board_distance_m(result: IntrinsicsResult) -> float:
 def projection_uncertainty(
     result: IntrinsicsResult, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
-    """Effect of the calibration's errors on projected points, without the part that the camera's pose absorbs.
+    """Propagate the calibration's errors to projected points, without the part that the camera's pose absorbs.
 
     A calibration determines a camera *and* its poses: a wrong principal point acts like a rotated camera. So the
     perturbed camera is first moved by the rigid motion that best aligns its view of the boards with the unperturbed
@@ -91,13 +91,13 @@ def projection_uncertainty(
         dq(p) = (dq/db + dq/dp [I, -[p]x] K) db + dq/dp [I, -[p]x] Σ H_i n_i
 
     and the covariance of dq follows, with the scale s² of `result.covariance` (including inflation).
-    Source: Kogan, mrcal, "Projection uncertainty", the form with a fitted implied transformation.
+    Source: Kogan, mrcal, "Projection uncertainty", the version with a fitted implied transformation.
 
     Args:
-        result: from `calibrate_intrinsics`.
-        distance_m: of the plane z = distance in the camera frame on which the projected points lie.
-        columns: of the grid.
-        rows: of the grid.
+        result: the result of `calibrate_intrinsics`.
+        distance_m: distance, along z of the camera frame, of the plane on which the projected points lie.
+        columns: number of the grid's columns.
+        rows: number of the grid's rows.
 
     Raises:
         DataError: the distance is not positive.
@@ -211,8 +211,8 @@ class CrossValidation:
 
     Attributes:
         folds: number of parts into which the views were split.
-        five_fold_rms_px: over all views, each held out once.
-        five_fold_view_px: (N,).
+        five_fold_rms_px: root mean square over all views, each held out once.
+        five_fold_view_px: (N,) error of each view.
         leave_one_out_rms_px: each view judged by a calibration without it (one Newton step).
         leave_one_out_view_px: (N,); NaN if the other views do not determine the camera.
     """

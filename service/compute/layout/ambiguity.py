@@ -1,4 +1,4 @@
-"""Whether spheres can be told apart by their layout: the least misfit of any wrong assignment, and what to change."""
+"""Judges whether a layout distinguishes its spheres, by the least misfit of wrong assignments, and what to change."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class BoundedLength:
 
 @dataclass(frozen=True, slots=True)
 class LayoutReport:
-    """How well the spheres of a layout can be told apart.
+    """The margins by which the spheres of a layout can be distinguished.
 
     Attributes:
         margin: least misfit of any wrong assignment of any four spheres; noise must stay well below it.
@@ -75,8 +75,8 @@ class LayoutReport:
         sphere_margins_m: (N,) least misfit of the assignments that mistake this sphere for another.
         depth: rms distance of the centres from their best plane.
         extent_m: rms distance of the centres from their mean.
-        largest_gap_rad: between neighbouring azimuths around the mean, in the best plane.
-        problems: what must be changed, in words; empty if the layout passes.
+        largest_gap_rad: largest gap between neighbouring azimuths around the mean, in the best plane.
+        problems: texts that say what must be changed; empty if the layout passes.
     """
 
     margin: BoundedLength
@@ -91,7 +91,7 @@ class LayoutReport:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing must be changed."""
+        """True if nothing must be changed."""
         return not self.problems
 
     @property
@@ -167,7 +167,7 @@ def _checked(centres_m: Array, radius_m: float) -> Array:
 
 
 def _sphere_margins(count: int, matches: Confusions) -> Array:
-    """For each sphere, (N,), the smallest misfit of an assignment that confuses it; infinite if there is none."""
+    """Return (N,) the smallest misfit of an assignment that confuses each sphere; infinite if there is none."""
     margins = np.full(count, np.inf)
     moved = matches.seen != matches.taken
     for column in range(SUBSET):
@@ -177,7 +177,7 @@ def _sphere_margins(count: int, matches: Confusions) -> Array:
 
 
 def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]:
-    """What must be changed, judged by the values themselves; gates judge the bounds."""
+    """Describe what must be changed, judged by the values themselves; gates judge the bounds."""
     problems: list[str] = []
     if report.margin_m < required_margin_m:
         first = report.worst[0]

@@ -1,4 +1,4 @@
-"""Suggests which sphere to move so that the spheres can be told apart, and shows the move to a person."""
+"""Suggests which sphere to move so that the spheres can be distinguished, and shows the move to a person."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Move:
     Attributes:
         sphere: its index.
         by_m: (3,) shift in the centres' frame.
-        margin_m: of the layout after this move and those before it.
+        margin_m: margin of the layout after this move and those before it.
     """
 
     sphere: int
@@ -60,16 +60,16 @@ def suggest_moves(
     fixed: Collection[int] = (),
     required_margin_m: float = REQUIRED_MARGIN_M,
 ) -> tuple[Move, ...]:
-    """Successive moves until no assignment can be confused; each is the one that leaves the largest margin.
+    """Suggest successive moves until no assignment can be confused; each is the one that leaves the largest margin.
 
     The margin of a move is the least over all places where a person following the advice may put the sphere.
 
     Args:
-        centres_m: (N, 3).
+        centres_m: (N, 3) the spheres' centres.
         up: (3,) unit vector away from the table, in the centres' frame.
         radius_m: radius of the spheres; moves keep them apart.
         fixed: spheres that cannot be moved.
-        required_margin_m: of four spheres.
+        required_margin_m: required margin of four spheres.
 
     Raises:
         ComputeError: no single move improves the layout.
@@ -159,7 +159,7 @@ def _directions(up: Array) -> list[Array]:
 
 
 def _fits(placed: Array, trial: Array, sphere: int, up: Array, radius_m: float) -> bool:
-    """Whether a sphere fits there: clear of the others, over the table, within their range of heights."""
+    """Return whether a sphere fits there: clear of the others, over the table, within their range of heights."""
     others = np.delete(distances(trial)[sphere], sphere)
     middle = placed.mean(axis=0)
     flat = placed - middle - np.outer((placed - middle) @ up, up)
@@ -183,7 +183,7 @@ class PhotographedMove:
     """A move in a photograph.
 
     Attributes:
-        words: what to do.
+        words: text that says what to do.
         from_px: (2,) the sphere's position in the image as captured.
         to_px: (2,) its position after the move along the table, before the change of height.
         higher_m: change of height.
@@ -198,14 +198,14 @@ class PhotographedMove:
 def show_move(
     move: Move, centres_m: Array, up: Array, T_photo_centres: Transform, camera: CameraModel, limit_m: float
 ) -> PhotographedMove:
-    """The move as seen in a photograph taken with `camera`.
+    """Show the move in a photograph taken with `camera`.
 
     Args:
-        move: in the centres' frame.
-        centres_m: (N, 3) before the move.
+        move: the move in the centres' frame.
+        centres_m: (N, 3) centres before the move.
         up: (3,) unit vector away from the table, in the centres' frame.
         T_photo_centres: maps that frame to the camera's.
-        camera: of the photograph.
+        camera: the photograph's camera.
         limit_m: required margin.
     """
     higher = float(move.by_m @ up)

@@ -33,13 +33,13 @@ class LensPrior:
     """Prior standard deviations of a camera's parameters.
 
     Attributes:
-        focal: relative, common to all photographs.
-        refocused: relative, of one photograph's focal length against the others', since the lens may have been
+        focal: focal length, relative, common to all photographs.
+        refocused: focal length of one photograph against the others', relative, since the lens may have been
             refocused.
-        aspect: of fy over fx.
-        centre: of the principal point, relative to the image's width.
-        k1, k2: of radial distortion.
-        tangential: of p1 and p2.
+        aspect: ratio of fy to fx.
+        centre: principal point, relative to the image's width.
+        k1, k2: coefficients of radial distortion.
+        tangential: coefficients p1 and p2.
     """
 
     focal: float = 0.02
@@ -76,7 +76,7 @@ class SpherePhotograph:
 
     @classmethod
     def of(cls, camera: CameraModel, outlines: Sequence[SphereOutline]) -> SpherePhotograph:
-        """From the outlines that the detector found with this camera."""
+        """Build it from the outlines that the detector found with this camera."""
         return cls(
             camera,
             tuple(o.cone for o in outlines),
@@ -96,8 +96,8 @@ class AdjustedLayout:
     Attributes:
         centres_m: (N, 3) in the frame of the first photograph.
         covariance: (3N, 3N) m² of all centres jointly, including the camera's uncertainty.
-        T_photo_first: for every photograph, maps the first photograph's frame to its own.
-        chi2: per degree of freedom; if above 1, the covariance is scaled by it.
+        T_photo_first: the map from the first photograph's frame to each photograph's own.
+        chi2: chi square per degree of freedom; if above 1, the covariance is scaled by it.
     """
 
     centres_m: Array
@@ -117,12 +117,12 @@ def adjust(
     """Adjust spheres, poses and camera to all outlines by Gauss–Newton with Huber weights.
 
     Args:
-        photographs: of the same camera.
-        spheres: for every photograph (n,), the sphere index of each outline.
+        photographs: photographs taken by one camera.
+        spheres: (n,) index of each outline's sphere, for every photograph.
         centres_m: (N, 3) initial centres; each sphere must be seen in some photograph.
         T_photo_first: initial poses; the first one stays the identity.
         radius_m: radius of the spheres, which defines the scale.
-        prior: of the camera.
+        prior: prior of the camera's parameters.
 
     Raises:
         ComputeError: no convergence, because the outlines do not fit together.

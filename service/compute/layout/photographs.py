@@ -37,10 +37,10 @@ class PhotoLayout:
     Attributes:
         centres_m: (N, 3) in the frame of the leading photograph.
         covariance: (3N, 3N) m² of all centres jointly.
-        spheres: for every photograph, the sphere of each of its outlines (-1: none); an empty array if the photograph
-            could not be used.
-        T_photo_first: for every photograph, maps the centres' frame to its own; None if it could not be used.
-        chi2: of the adjustment, per degree of freedom.
+        spheres: the sphere of each of a photograph's outlines (-1: none), for every photograph; an empty array if the
+            photograph could not be used.
+        T_photo_first: the map from the centres' frame to each photograph's own; None if it could not be used.
+        chi2: chi square of the adjustment, per degree of freedom.
     """
 
     centres_m: Array
@@ -58,16 +58,16 @@ class PhotoLayout:
 def layout_from_photographs(
     photographs: Sequence[SpherePhotograph], radius_m: float, prior: LensPrior, expected: int | None = None
 ) -> PhotoLayout:
-    """One layout from photographs of spheres that did not move in between.
+    """Compute one layout from photographs of spheres that did not move in between.
 
     The photograph with the most spheres leads. From a single photograph, depths follow from the outlines' sizes, to
     some tenths of a millimetre at best. With a second viewpoint they follow from the directions, ten times better,
     and the camera is calibrated at the same time.
 
     Args:
-        photographs: from one camera.
+        photographs: photographs taken by one camera.
         radius_m: radius of the spheres.
-        prior: of the camera.
+        prior: prior of the camera's parameters.
         expected: number of spheres; if more are found, those seen in the fewest photographs are dropped.
 
     Raises:
@@ -153,17 +153,17 @@ def _joined(
 
 
 def _without_doubles(joined: _Group, adjusted: AdjustedLayout, known: int, radius_m: float) -> tuple[_Group, Array]:
-    """The group and its centres without spheres of the newest photograph that are known ones.
+    """Drop the newest photograph's spheres that are known ones from the group and its centres.
 
     Spheres are solid: one that lies in a known one is that sphere, or outlined twice, and then none. In the direction
     of a known sphere that the photograph shows nowhere else, the outline is that sphere's, though by its size it is
     nearer or farther.
 
     Args:
-        joined: with the newest photograph last.
+        joined: the group, with the newest photograph last.
         adjusted: the group's layout.
         known: number of spheres before that photograph; its own come behind.
-        radius_m: of the spheres.
+        radius_m: radius of the spheres.
     """
     ids = joined.spheres[-1].copy()
     kept = np.ones(len(adjusted.centres_m), dtype=bool)
@@ -198,7 +198,7 @@ def _reduced(
     radius_m: float,
     prior: LensPrior,
 ) -> tuple[_Group, AdjustedLayout]:
-    """Without the spheres seen in the fewest photographs, which are other round objects."""
+    """Drop the spheres seen in the fewest photographs, which are other round objects."""
     count = np.bincount(np.concatenate([i[i >= 0] for i in group.spheres]), minlength=len(found.centres_m))
     kept = np.sort(np.argsort(-count, kind="stable")[:expected])
     if count[kept].min() == count[np.setdiff1d(np.arange(len(count)), kept)].max():

@@ -211,7 +211,7 @@ class ObservedCones:
 
     @classmethod
     def of(cls, cones: Iterable[Cone]) -> ObservedCones:
-        """With tilts along the first two columns of each cone's `frame()`, as in SphereOutline.cone_covariance."""
+        """Collect cones, with tilts along the first two columns of `frame()`, as in SphereOutline.cone_covariance."""
         found = list(cones)
         return cls(
             np.array([c.axis for c in found], dtype=np.float64).reshape(-1, 3),

@@ -76,13 +76,13 @@ def detect_spheres(
 def confirmed_outlines(
     image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[RoughSphere], options: DetectionOptions
 ) -> tuple[SphereOutline, ...]:
-    """The outlines near rough ones that the edges at full resolution confirm, the most certain first.
+    """Return the outlines near rough ones that the edges at full resolution confirm, the most certain first.
 
     Args:
         image_bgr: (H, W, 3), of the camera's size.
         camera: intrinsics.
-        roughs: the best first; of those in one place, the first that is confirmed counts.
-        options: of the detector.
+        roughs: rough spheres, the best first; of those in one place, the first that is confirmed counts.
+        options: the detector's options.
     """
     todo = list(roughs)
     found: list[SphereOutline] = []
@@ -144,7 +144,7 @@ def _confirmed(
 
 
 def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) -> bool:
-    """Whether two outlines of one place are nearly as good but differ by more than their uncertainty."""
+    """Return whether two outlines of one place are nearly as good but differ by more than their uncertainty."""
     tilt = best.cone.frame()[:, :2].T @ (other.cone.axis - best.cone.axis)
     d = np.append(tilt, other.cone.half_angle_rad - best.cone.half_angle_rad)
     chi2 = float(d @ np.linalg.solve(best.cone_covariance + other.cone_covariance, d)) / 3
@@ -207,13 +207,13 @@ def _within(direction: Array, cone: Cone) -> bool:
 
 
 def _on(inner: Cone, outer: Cone) -> bool:
-    """Whether a disc lies on a clearly larger one."""
+    """Return whether a disc lies on a clearly larger one."""
     small = inner.half_angle_rad < 0.65 * outer.half_angle_rad
     return small and _within(inner.axis, outer)
 
 
 def _without_overlaps(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Without discs on larger discs, and not too many for one place."""
+    """Drop discs on larger discs, and those that are too many for one place."""
     # Stains and highlights are discs too, but lie on a sphere.
     whole = [r for r in roughs if r.coverage > 0.6 and r.mask_loss < 0.4]
     roughs = [r for r in roughs if not any(_on(r.cone, w.cone) for w in whole)]
@@ -257,7 +257,7 @@ def _of_one_colour(
 
 
 def _of_one_size(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Without discs much smaller or larger than the clear ones: equal spheres are at similar distances."""
+    """Drop discs much smaller or larger than the clear ones: equal spheres are at similar distances."""
     clear = [r.cone.half_angle_rad for r in roughs if r.score > CLEAR]
     if len(clear) < _CLEAR_SPHERES:
         return roughs
@@ -290,10 +290,10 @@ class Detector(Protocol):
 
 
 def options_for(colour: str | None, largest: float | None = None) -> DetectionOptions:
-    """Default options with the spheres' colour, by name or as #rrggbb; None: it is learnt from each image.
+    """Return default options with the spheres' colour, by name or as #rrggbb; None: it is learnt from each image.
 
     Args:
-        colour: of the spheres.
+        colour: the spheres' colour.
         largest: largest radius searched for, over the image's width; None: the default.
 
     Raises:

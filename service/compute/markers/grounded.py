@@ -50,7 +50,7 @@ class GroundedDetector:
 
     @classmethod
     def of(cls, weights: Weights, least: int, *, vote: bool = False) -> GroundedDetector:
-        """With the weights of a folder; see `load_networks` for the errors raised."""
+        """Load the detector with the weights of a folder; see `load_networks` for the errors raised."""
         return cls(load_networks(weights), least, vote)
 
     def __call__(self, path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
@@ -139,7 +139,7 @@ class _Tile:
     bottom: int
 
     def cuts(self, box: Array, width: int, height: int) -> bool:
-        """Whether a box in pixels of the image ends at a border of the tile that is not one of the image."""
+        """Return whether a box in pixels of the image ends at a border of the tile that is not one of the image."""
         x, y = _BORDER * (self.right - self.left), _BORDER * (self.bottom - self.top)
         return bool(
             (self.left > 0 and box[0] < self.left + x)
@@ -152,13 +152,13 @@ class _Tile:
 def find_boxes(
     image_bgr: NDArray[np.uint8], networks: Networks, least: int, options: DetectionOptions = DEFAULTS
 ) -> list[Box]:
-    """Boxes (left, top, right, bottom) in pixels of an image (H, W, 3), the most certain first.
+    """Find boxes (left, top, right, bottom) in pixels of an image (H, W, 3), the most certain first.
 
     The threshold falls from FIRST_THRESHOLD until there are `least` boxes or it is below LAST_THRESHOLD (paper,
     "Sphere Detection").
 
     Args:
-        image_bgr: of any size; larger ones are searched in tiles as well.
+        image_bgr: an image of any size; larger ones are searched in tiles as well.
         networks: Grounding DINO.
         least: spheres expected in the image.
         options: the range of radii, as fractions of the image's width.
@@ -242,7 +242,7 @@ def normalised(picture: NDArray[np.uint8], size: tuple[int, int]) -> Floats:
 
 
 def _apart(boxes: Array) -> list[Array]:
-    """Of boxes (N, 4), the best first, those that are not on a better one."""
+    """Select from boxes (N, 4), the best first, those that are not on a better one."""
     kept: list[Array] = []
     for box in boxes:
         if all(not _overlap(box, other) for other in kept):
@@ -262,15 +262,15 @@ _PICTURES_AT_ONCE = 6  # pictures given to the network at once: two boxes
 def _sphere_masks(
     image_bgr: NDArray[np.uint8], boxes: Sequence[Box], networks: Networks
 ) -> Iterator[NDArray[np.bool_] | None]:
-    """For each box a (MASK_SIDE, MASK_SIDE) mask of the sphere in its middle; None if there is none.
+    """Yield a (MASK_SIDE, MASK_SIDE) mask of the sphere in each box's middle; None if there is none.
 
-    SAM 2 sees each colour channel as a grey picture and is pointed at its middle; what any channel shows is kept
+    SAM 2 sees each colour channel as a grey picture and is pointed at its middle; the mask has what any channel shows
     (paper, "Sphere Segmentation").
 
     Args:
         image_bgr: (H, W, 3).
-        boxes: with a margin around the sphere.
-        networks: SAM 2.
+        boxes: boxes with a margin around the sphere.
+        networks: the networks of SAM 2.
     """
     size = (networks.side_px, networks.side_px)
     per_batch = _PICTURES_AT_ONCE // 3

@@ -63,7 +63,7 @@ class ImageSearch:
 class LocatedOutlines:
     """Outlines of all images and how they were found.
 
-    `assignments` tells which outlines are registration spheres; None if every image was searched whole, so that they
+    `assignments` says which outlines are registration spheres; None if every image was searched whole, so that they
     must still be identified. `ImageSearch.missing` numbers the registration spheres first, then the control spheres,
     then others that the anchors show.
     """
@@ -103,12 +103,12 @@ def detect_all(
     progress: Progress | None = None,
     detect: DetectFile | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
-    """The outlines in all images, in the given order, every image searched whole.
+    """Detect the outlines in all images, in the given order, every image searched whole.
 
     Args:
         image_paths: JPEG, PNG or TIFF files of the camera's size.
         camera: intrinsics.
-        options: of the detector.
+        options: the detector's options.
         workers: number of processes; 1 computes in this one.
         progress: called with (done, total) after each image.
         detect: another detector for one file, which must be picklable; None: `detect_file`.
@@ -137,7 +137,7 @@ def locate_outlines(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> LocatedOutlines:
-    """The outlines in all images, searched only where the poses predict spheres.
+    """Detect the outlines in all images, searched only where the poses predict spheres.
 
     A few images of each station, spread over its poses, are searched whole at reduced size. Their identification and
     a provisional registration predict every sphere in every image, and how far the poses may be off. An image with
@@ -150,7 +150,7 @@ def locate_outlines(
         spheres: registration and control spheres.
         scenes: (N,) images of the same number show the same spheres; between numbers, spheres that are in no list may
             have come or gone. None: all the same.
-        options: of the detector.
+        options: the detector's options.
         workers: number of processes; 1 computes in this one.
         progress: called with (done, total) after each image.
 
@@ -185,7 +185,7 @@ def locate_outlines(
 def _located(
     found: Sequence[ImageOutlines], first: AnchorRegistration, camera: CameraModel, spheres: ScanSpheres
 ) -> LocatedOutlines:
-    """What was found at the predicted places, with the registration spheres identified."""
+    """Combine the outlines found at the predicted places, with the registration spheres identified."""
     centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
     assignments: list[Assignment] = []
     for f, T in zip(found, first.T_scan_camera, strict=True):
@@ -284,8 +284,8 @@ class AnchorRegistration:
     """The provisional registration.
 
     Attributes:
-        T_scan_camera: (N, 4, 4).
-        scale: of the poses' positions.
+        T_scan_camera: (N, 4, 4) provisional camera poses in the scan frame.
+        scale: scale of the poses' positions.
         margin: largest expected displacement of a sphere from its predicted place, in radii.
         tone: brightness of the spheres.
         unlisted_m: (U, 3) spheres in no list, scan frame.

@@ -30,11 +30,11 @@ class LimbProfiles:
     """Values along K profiles across each of G outlines, lengths in the unit of the offsets.
 
     Attributes:
-        coded_bgr: (G, K, J, 3).
+        coded_bgr: (G, K, J, 3) values along the profiles.
         offsets: (J,) positions across the outline, evenly spaced, positive outside.
-        inside: (G, K) whether a profile lies in the image.
-        radius: (G,) of the outlines.
-        srgb: whether values are sRGB coded.
+        inside: (G, K) true if a profile lies in the image.
+        radius: (G,) radius of the outlines.
+        srgb: true if values are sRGB coded.
     """
 
     coded_bgr: Coded
@@ -46,16 +46,16 @@ class LimbProfiles:
 
 @dataclass(frozen=True, slots=True)
 class LimbModel:
-    """What the forward model is evaluated on.
+    """The data on which the forward model is evaluated.
 
     Attributes:
         data: (G, 3, K, J) Y, Cb, Cr of the profiles.
         t: (J,) offsets.
         wide: (J',) offsets with margins for the blur.
         sharp: (J', J) interpolation from `wide` to `t`.
-        radius: (G,) of the outlines.
+        radius: (G,) radius of the outlines.
         tone: (G, 3) the spheres' colour in linear light.
-        srgb: whether values are sRGB coded.
+        srgb: true if values are sRGB coded.
     """
 
     data: Array32
@@ -322,7 +322,7 @@ def fit_limb(
 
 @dataclass(frozen=True, slots=True)
 class _Shading:
-    """What is known about the profiles' shading: the limb's rise is similar all around, and slopes are small.
+    """The prior of the profiles' shading: the limb's rise is similar all around, and slopes are small.
 
     Values are (G, K), and how far a profile may deviate is (G, 1).
     """

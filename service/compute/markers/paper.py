@@ -60,17 +60,17 @@ def detect_by_masks(
     options: DetectionOptions = DEFAULTS,
     boxes: Sequence[Box] | None = None,
 ) -> tuple[SphereOutline, ...]:
-    """Outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"), the best first.
+    """Detect outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"), the best first.
 
     Boxes and masks replace Grounding DINO and SAM 2: boxes come from circle votes unless given, masks from GrabCut on
-    each channel, started at the middle. Kept for comparison with the default detector; its edge points lie on whole
-    pixels of one grey image.
+    each channel, started at the middle. It serves for comparison with the default detector; its edge points lie on
+    whole pixels of one grey image.
 
     Args:
-        image_bgr: at the camera's size.
+        image_bgr: an image of the camera's size.
         camera: used to undistort points before the conic is fitted.
         options: radii, coverage and number of points are used.
-        boxes: from another detector; None: found here.
+        boxes: boxes of another detector; None: they are found here.
     """
     found: list[SphereOutline] = []
     for box in find_boxes(image_bgr, options) if boxes is None else boxes:
@@ -107,9 +107,9 @@ def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULT
 
 
 def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | None:
-    """(side, side) mask of the sphere in the middle of the reduced box; None if there is none.
+    """Return a (side, side) mask of the sphere in the middle of the reduced box; None if there is none.
 
-    The masks of the channels are joined, opened and closed, and the component that contains the middle is kept. The
+    The masks of the channels are joined, opened and closed, and the component that contains the middle is used. The
     middle is assumed to be sphere and the box's corners background; GrabCut decides the rest.
     """
     patch = cv2.resize(cut(image_bgr, box), (MASK_SIDE, MASK_SIDE), interpolation=cv2.INTER_AREA)
@@ -276,12 +276,12 @@ def detect_file_by_masks(
     options: DetectionOptions = DEFAULTS,
     boxes: Mapping[str, Sequence[Box]] | None = None,
 ) -> tuple[SphereOutline, ...]:
-    """The outlines in one image file by the paper's chain.
+    """Detect the outlines in one image file by the paper's chain.
 
     Args:
         path: JPEG, PNG or TIFF of the camera's size.
         camera: intrinsics.
-        options: of the detector.
+        options: the detector's options.
         boxes: (left, top, right, bottom) in pixels by file name; an image without an entry has no sphere. None: found
             by circle votes.
 

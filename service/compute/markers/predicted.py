@@ -42,7 +42,7 @@ class Tone:
     reach: float
 
     def admits(self, outline: SphereOutline) -> bool:
-        """Whether the outline's colour may be a marker's."""
+        """Return whether the outline's colour may be a marker's."""
         a, b = _chromaticity([outline])[0]
         return bool(np.hypot(a - self.a, b - self.b) <= self.reach)
 
@@ -76,7 +76,7 @@ class PredictedSpheres:
     voting: int | None = None
 
     def votes(self, sphere: int) -> bool:
-        """Whether a sphere takes part in choosing outlines."""
+        """Return whether a sphere takes part in choosing outlines."""
         return self.voting is None or sphere < self.voting
 
 
@@ -91,7 +91,7 @@ class PredictedOutlines:
 
     @property
     def convincing(self) -> bool:
-        """Whether so many voting spheres were found where predicted that the prediction must be right."""
+        """True if so many voting spheres were found where predicted that the prediction must be right."""
         found, lacking = (
             sum(self.voting is None or m < self.voting for m in part) for part in (self.outlines, self.missing)
         )
@@ -214,7 +214,7 @@ def _starts(
 
 
 def _within_gate(cone: Cone, predicted: Cone, part: float = 1.0) -> bool:
-    """Whether a cone, of which a part 0 … 1 of the outline is visible, is where the other spheres predict it."""
+    """Return whether a cone is where the other spheres predict it; a part 0 … 1 of its outline is visible."""
     place, size = deviation(cone, predicted)
     return place <= _GATE.place / part and size <= _GATE.size / part
 
@@ -362,13 +362,13 @@ def find_nearby(
     expected: Sequence[tuple[Cone, float]],
     options: DetectionOptions = DEFAULTS,
 ) -> tuple[SphereOutline, ...]:
-    """Outlines of spheres around expected ones in an image (H, W, 3), which may be others than those expected.
+    """Find outlines of spheres around expected ones in an image (H, W, 3); they may be others than those expected.
 
     Args:
-        image_bgr: of the camera's size.
+        image_bgr: an image of the camera's size.
         camera: intrinsics.
         expected: cones of the expected spheres, and the angle (rad) by which each may be elsewhere.
-        options: of the detector.
+        options: the detector's options.
     """
     found: list[SphereOutline] = []
     for cone, window_rad in expected:
@@ -379,7 +379,7 @@ def find_nearby(
 
 
 def is_another(outline: SphereOutline, known: Sequence[SphereOutline]) -> bool:
-    """Whether an outline is of another sphere than each of those that are known in the same image."""
+    """Return whether an outline is of another sphere than each of those that are known in the same image."""
     apart = (float(np.linalg.norm(outline.cone.axis - other.cone.axis)) for other in known)
     return all(gap > _SAME * outline.cone.half_angle_rad for gap in apart)
 

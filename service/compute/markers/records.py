@@ -215,13 +215,13 @@ def colour_of(text: str) -> tuple[Colour, float]:
 
 
 def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *, srgb: bool) -> ColourModel | None:
-    """The colour that most of the discs share, since all spheres have one colour; None if too few agree.
+    """Learn the colour that most of the discs share, since all spheres have one colour; None if too few agree.
 
     Args:
         colours_bgr: (N, 3) median colours of discs.
-        weights: (N,) how much each looks like a sphere.
+        weights: (N,) likeness of each to a sphere.
         clear: (N,) discs that pass every test by themselves; at least one must have the colour.
-        srgb: whether the values are sRGB coded.
+        srgb: true if the values are sRGB coded.
     """
     if len(colours_bgr) < _MEMBERS:
         return None

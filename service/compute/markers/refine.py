@@ -407,13 +407,13 @@ def remeasure_file(
 def remeasure(
     coded_bgr: Pixels, camera: CameraModel, outlines: Sequence[SphereOutline], options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline | None, ...]:
-    """The outlines that the JPEG showed, measured in another picture of the same exposure.
+    """Measure the outlines that the JPEG showed in another picture of the same exposure.
 
     Args:
         coded_bgr: (H, W, 3), sRGB coded: the noise is then about the same in shadows and lights, as the fit assumes.
         camera: intrinsics.
         outlines: found in the JPEG.
-        options: of the detector.
+        options: the detector's options.
 
     Returns:
         One for each outline; None where this picture shows none there.

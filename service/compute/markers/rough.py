@@ -94,7 +94,7 @@ class _EdgePixels:
     shape: tuple[int, int]  # with the margins
 
     def votes(self, radius: np.int64) -> NDArray[np.float32]:
-        """For each pixel, the share of a circle of this radius around it that votes for it."""
+        """Return for each pixel the share of a circle of this radius around it that votes for it."""
         rows, columns = self.shape
         flat = np.concatenate(
             [

@@ -104,7 +104,7 @@ class MatchingData:
 
     @property
     def names(self) -> set[str]:
-        """Of the views."""
+        """The names of the views."""
         return set(self._views)
 
     def view(self, name: str) -> View:
@@ -122,7 +122,7 @@ class MatchingData:
 
 
 def correspondences(first: View, second: View, pixels: Array | None = None, *, step: int = 1) -> Correspondences:
-    """Where points of the surface that the first image shows are in the second.
+    """Find where points of the surface that the first image shows are in the second.
 
     Args:
         first: image in which the points are given.

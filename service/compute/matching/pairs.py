@@ -104,12 +104,12 @@ OVERLAP_STEPS = (0.6, 0.4, 0.2)
 
 @dataclass(frozen=True, slots=True)
 class Difficulty:
-    """What makes a pair difficult.
+    """The measures that make a pair difficult.
 
     Attributes:
         angle_deg: median angle at the common points between the rays to both cameras.
         scale: median ratio of the sizes of the common points' surroundings in both images, at least 1.
-        overlap: the smaller one of both directions.
+        overlap: smaller one of the overlaps in both directions.
     """
 
     angle_deg: float
@@ -177,12 +177,12 @@ class ListedPair:
 def listed_pairs(
     views: Mapping[str, View], points_m: Array, covisible: Covisibility, errors: Array | None = None
 ) -> list[ListedPair]:
-    """The pairs of views that overlap, in the order of their names.
+    """List the pairs of views that overlap, in the order of their names.
 
     Args:
-        views: by name, in the order of `covisible`; their depth is not needed.
+        views: views by name, in the order of `covisible`; their depth is not needed.
         points_m: (P, 3) points of the surface, in the world frame.
-        covisible: what the views see of them.
+        covisible: the points that each view sees.
         errors: (6 V, 6 V) joint covariance of the poses; errors common to all cancel; None if unknown.
     """
     names = list(views)

@@ -73,9 +73,9 @@ class PoseError:
     """Angles between an estimated relative pose and the true one, degrees.
 
     Attributes:
-        rotation_deg: of the rotation that is left.
-        translation_deg: between the directions of the translations, at most 90°: an essential matrix does not tell
-            their sign.
+        rotation_deg: angle of the rotation that is left.
+        translation_deg: angle between the directions of the translations, at most 90°: an essential matrix does not
+            give their sign.
     """
 
     rotation_deg: float
@@ -154,17 +154,17 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class PairScore:
-    """What a method did on a pair.
+    """The result of a method on a pair.
 
     Attributes:
         first, second, difficulty: the pair.
-        matches: that it found.
+        matches: number of matches that it found.
         scored: those whose pixel in the first image has ground truth.
         precision: share of these within each of PRECISION_PX.
         pose: error of the relative pose; infinite without one.
         inliers: matches that agree with the estimated pose.
         epipolar_px: median of the epipolar errors; infinite without a match.
-        seconds: for the matching alone. Features of an image are extracted with its first pair.
+        seconds: time for the matching alone. Features of an image are extracted with its first pair.
     """
 
     first: str

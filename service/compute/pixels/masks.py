@@ -45,12 +45,12 @@ def posts_below(spheres: Sequence[WorldSphere], up: Array, length_m: float, radi
 def marker_mask(
     camera: CameraModel, T_world_camera: Transform, spheres: Sequence[WorldSphere], posts: Sequence[Cylinder] = ()
 ) -> NDArray[np.bool_]:
-    """(H, W) pixels that a sphere or post covers or touches, also where something else hides it.
+    """Compute the (H, W) pixels that a sphere or post covers or touches, also where something else hides it.
 
     An outline is widened to whole pixels, so the mask never misses a pixel of a marker.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     T_camera_world = inverse(T_world_camera)
@@ -66,12 +66,12 @@ def marker_mask(
 
 
 def hull_mask(camera: CameraModel, T_world_camera: Transform, points_m: Array) -> NDArray[np.bool_]:
-    """(H, W) pixels within the outline of points (N, 3) of the world, for example the spheres around a specimen.
+    """Compute the (H, W) pixels within the outline of points (N, 3) of the world, such as a specimen's spheres.
 
     Points behind the camera do not count.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     points = apply(inverse(T_world_camera), points_m)

@@ -236,10 +236,10 @@ class SurfaceImage:
 
 
 def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Iterator[SurfaceRows]:
-    """The mesh as the camera at T_world_camera (4, 4) sees it, from the first rows of the image to the last.
+    """Yield the mesh as the camera at T_world_camera (4, 4) sees it, from the first rows of the image to the last.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     rays = pixel_rays(camera)
     planes = surface.planes_seen(T_world_camera)
@@ -271,10 +271,10 @@ def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: in
 
 
 def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> SurfaceImage:
-    """The whole image at once: 16 bytes for each pixel, 1 GB at 60 million.
+    """Render the whole image at once: 16 bytes for each pixel, 1 GB at 60 million.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     depth = np.empty((camera.height, camera.width), dtype=np.float32)
     normal = np.empty((camera.height, camera.width, 3), dtype=np.float32)
@@ -285,10 +285,10 @@ def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Su
 
 
 def depth_map(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Float32s:
-    """(H, W) z-depth in metres alone; 0 where no surface is seen.
+    """Render (H, W) z-depth in metres alone; 0 where no surface is seen.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     depth = np.empty((camera.height, camera.width), dtype=np.float32)
     for rows in seen_rows(surface, camera, T_world_camera):
@@ -302,11 +302,11 @@ _TOLERANCE_M = 1e-3  # a point so far behind the depth of its pixel is still on 
 def seen_points(
     points_m: Array, camera: CameraModel, T_world_camera: Transform, depth_m: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
+    """Return whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
 
     Args:
-        points_m: on the surface that the depth is of.
-        camera: of the depth.
+        points_m: (N, 3) points on the surface whose depth `depth_m` is.
+        camera: the camera of the depth.
         T_world_camera: (4, 4) of the view.
         depth_m: (H, W) z of the surface; 0 where none is seen.
     """

@@ -64,7 +64,7 @@ def valid_pixels(camera: CameraModel) -> NDArray[np.bool_]:
 
 
 def _places(pinhole: CameraModel, camera: CameraModel) -> Iterator[tuple[int, int, Array]]:
-    """For tiles of rows [begin, end) of the undistorted image: (end - begin, W, 2) places in the photograph."""
+    """Yield tiles of rows [begin, end) of the undistorted image, and (end - begin, W, 2) places in the photograph."""
     rays = pixel_rays(pinhole)
     step = max(1, _RAYS // camera.width)
     for begin in range(0, camera.height, step):

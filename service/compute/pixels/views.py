@@ -94,7 +94,7 @@ class ImageCrop:
 def marker_free_crops(
     wanted: Mask, forbidden: Mask, size: tuple[int, int] = FULL_HD, most: int = 16
 ) -> list[ImageCrop]:
-    """Crops without a forbidden pixel that show most of the wanted pixels, the best first.
+    """Choose crops without a forbidden pixel that show most of the wanted pixels, the best first.
 
     Each further crop is the one that shows most pixels which no earlier one shows, as long as these are a twentieth
     of it. Equal ones are chosen from the top left. The answer is empty where no place is free of markers.
@@ -103,7 +103,7 @@ def marker_free_crops(
         wanted: (H, W) the specimen.
         forbidden: (H, W) spheres and posts.
         size: width and height of a crop.
-        most: at most so many crops.
+        most: largest number of crops.
 
     Raises:
         ConfigurationError: a crop is larger than the image, or smaller than 8 px.

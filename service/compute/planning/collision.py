@@ -183,14 +183,14 @@ _SEED = 7  # the same question always has the same answer
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """Where an arm may be: the clearance that it must keep from everything, itself included."""
+    """The space in which an arm may be: the clearance that it must keep from everything, itself included."""
 
     body: ArmBody
     obstacles: Obstacles
     margin_m: float
 
     def obstruction(self, joints_rad: Array) -> str:
-        """What it would come too near to at the worst of the joints (K, N), in words; "" if it keeps clear."""
+        """Name what it would come too near to at the worst of the joints (K, N); "" if it keeps clear."""
         if not len(joints_rad):
             return ""
         contacts = nearest_contacts(self.body, self.obstacles, joints_rad)
@@ -198,7 +198,7 @@ class Freedom:
         return str(worst) if worst.clearance_m < self.margin_m else ""
 
     def obstruction_between(self, start_rad: Array, end_rad: Array) -> str:
-        """What blocks the straight way between two joints (N,). The ends are free, or the arm is there already."""
+        """Name what blocks the straight path between joints (N,). The ends are free, or the arm is already there."""
         return self.obstruction(straight_path(start_rad, end_rad, PATH_STEP_RAD)[1:-1])
 
 

@@ -73,13 +73,13 @@ def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
 def place_at(
     name: str, *, tilt_deg: float, azimuth_deg: float, distance_m: float, walk_round: bool, aim_m: Sequence[float]
 ) -> WantedView:
-    """A place on the hemisphere around the scene.
+    """Compute a place on the hemisphere around the scene.
 
     Args:
-        tilt_deg: of the line of sight from the vertical.
+        tilt_deg: angle of the line of sight from the vertical.
         azimuth_deg: 0 is the person's side, positive to the person's right.
-        distance_m: from `aim_m`.
-        walk_round: whether the person walks round the scene and the top of the image points away from the person;
+        distance_m: distance from `aim_m`.
+        walk_round: true if the person walks round the scene and the top of the image points away from the person;
             otherwise it stays as in the first image.
         aim_m: (3,) point that the camera looks at, level frame.
     """
@@ -152,6 +152,6 @@ def nearest(places: Iterable[WantedView], T_level_here: Transform) -> WantedView
 
 
 def same_view(T_a: Transform, T_b: Transform, apart_m: float, apart_rad: float) -> bool:
-    """Whether two camera poses in one frame are so near that the second image adds nothing."""
+    """Return whether two camera poses in one frame are so near that the second image adds nothing."""
     T = inverse(T_a) @ T_b
     return bool(np.linalg.norm(T[:3, 3]) < apart_m and Rotation.from_matrix(T[:3, :3]).magnitude() < apart_rad)

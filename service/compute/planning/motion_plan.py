@@ -25,7 +25,7 @@ class DepthOfField:
 def depth_of_field(
     focal_length_m: float, aperture_f: float, focus_distance_m: float, circle_of_confusion_m: float
 ) -> DepthOfField:
-    """Near and far limit for a thin lens focused at a distance from its entrance pupil.
+    """Compute near and far limit, in metres, for a thin lens focused at a distance from its entrance pupil.
 
     With H = f² / (N c) + f: near = s (H − f) / (H + s − 2 f), far = s (H − f) / (H − s).
     Source: S. F. Ray, Applied Photographic Optics, 3rd ed. 2002, chapter 22.
@@ -73,7 +73,7 @@ class PlanningScene:
 
     @property
     def freedom(self) -> Freedom:
-        """Where the arm may be."""
+        """The space in which the arm may be."""
         return Freedom(self.body, self.obstacles, self.margin_m)
 
 

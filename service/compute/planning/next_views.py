@@ -37,15 +37,15 @@ def view_information(
     centre_m: Array,
     pose_sigma_m: float,
 ) -> ViewInformation:
-    """Information of one image's assigned outlines about T_base_scan, linearised there.
+    """Compute the information of one image's assigned outlines about T_base_scan, linearised there.
 
     Args:
         T_base_camera: pose of the camera.
-        T_base_scan: where it is linearised.
-        outlines: of the image.
+        T_base_scan: the pose at which it is linearised.
+        outlines: the image's outlines.
         markers: outline → sphere.
-        spheres: in the scan frame.
-        centre_m: (3,) base frame.
+        spheres: the spheres in the scan frame.
+        centre_m: (3,) centre of the scene, base frame.
         pose_sigma_m: the arm's nominal scatter; outlines that contradict the solution by much more are excluded.
     """
     base = apply(T_base_scan, spheres.centres_m)

@@ -82,10 +82,10 @@ def _transforms_in(folder: Path) -> Path | None:
 def posed_images(
     path: Path, images: ImageFolder, folder: Path, *, strict: bool = False
 ) -> tuple[dict[str, Transform], ImageFolder]:
-    """T_world_camera by name for the images that have a pose, and these images; the others are left out.
+    """Read T_world_camera by name for the images that have a pose; return these images too, without the others.
 
     Raises:
-        DataError: as `read_poses`; no image has a pose; or, with `strict`, one has none.
+        DataError: `read_poses` fails; no image has a pose; or, with `strict`, one has none.
     """
     chosen, _ = _matched(read_poses(path), [file.name for file in images.files], path)
     return chosen, only_posed(images, chosen, path, folder, strict=strict)
@@ -119,10 +119,10 @@ def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -
 def _matched(
     poses: Mapping[str, Transform], images: Sequence[str], path: Path
 ) -> tuple[dict[str, Transform], list[str]]:
-    """Poses by image, and the names of the images without one.
+    """Match poses to images; return the names of the images without one too.
 
     Raises:
-        DataError: as `matched_names`, or none of the images has one.
+        DataError: `matched_names` fails, or none of the images has one.
     """
     names = matched_names(images, poses, str(path))
     if images and not names:
@@ -332,7 +332,7 @@ _COLUMNS = 8
 
 
 def _is_trajectory(table: TextTable) -> bool:
-    """Whether a table has eight numbers in its first line, separated by spaces, and so no header and no names."""
+    """Return whether a table's first line is eight numbers separated by spaces, and so no header and no names."""
     if not table.rows or table.dialect.separator != " ":
         return False
     cells = table.rows[0].cells
@@ -383,13 +383,13 @@ _NAMED = 3
 
 
 def matched_names(images: Sequence[str], named: Collection[str], where: str, *, what: str = "pose") -> dict[str, str]:
-    """For each image that a file names, its name there.
+    """Return, for each image that a file names, its name there.
 
     Args:
         images: names of image files.
         named: the names in the file.
         where: names the file in errors.
-        what: the file has of each image.
+        what: content that the file has of each image, for errors.
 
     Raises:
         DataError: a name in the file can be several images, or several names one image.

@@ -67,11 +67,11 @@ class RobotPoseTable:
     """The rows of a file of poses.
 
     Attributes:
-        names: of the images; None if the file has none.
+        names: names of the images; None if the file has none.
         position: (M, 3) as written.
         rotation: (M, 3 or 4) as written.
-        form: what `rotation` is.
-        unit: of `position`.
+        form: format of `rotation`.
+        unit: unit of `position`.
         plain: the file says itself what it holds: names, and quaternions in metres.
     """
 
@@ -111,15 +111,15 @@ class RobotPoseTable:
 def read_robot_poses(
     path: Path, *, form: RotationForm | None = None, unit: LengthUnit | None = None
 ) -> RobotPoseTable:
-    """The table of poses in a file of delimited text.
+    """Read the table of poses in a file of delimited text.
 
     Args:
-        path: of the file.
-        form: of the rotations; None: by the header, the number of columns and the size of the numbers.
-        unit: of the positions; None: by the header, else metres.
+        path: the file.
+        form: format of the rotations; None: by the header, the number of columns and the size of the numbers.
+        unit: unit of the positions; None: by the header, else metres.
 
     Raises:
-        DataError: there is no pose, or a row has another form; the message names file:line.
+        DataError: there is no pose, or a row has another format; the message names file:line.
     """
     lines = [(line, _cells(row)) for line, row in csv_rows(path)]
     if not lines:
@@ -164,10 +164,10 @@ def read_robot_poses(
 
 
 def matched_rows(table: RobotPoseTable, images: Sequence[str], path: Path) -> dict[str, int]:
-    """The row of each image that has one: by name, or, without names, by the order of the numbers in the names.
+    """Find the row of each image that has one: by name, or, without names, by the order of the numbers in the names.
 
     Raises:
-        DataError: without names, there are more or fewer rows than images; with names, as `matched_names`.
+        DataError: the table has no names, and more or fewer rows than images; or `matched_names` fails.
     """
     if table.names is None:
         if len(table.position) != len(images):
@@ -200,7 +200,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Where a table has its numbers, and what they are."""
+    """The columns in which a table has its numbers, and their meaning."""
 
     header: bool
     count: int
@@ -357,10 +357,10 @@ _LARGEST_RAD = 4 * np.pi  # beyond any arm's range: the file is in degrees
 
 
 def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
-    """Joints (N,) in radians by image name; N is the number of columns q1, q2, …
+    """Read the joints (N,) in radians by image name; N is the number of columns q1, q2, …
 
     Raises:
-        DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.
+        DataError: the file is missing or malformed (with file:line), in degrees, or has no row for an image.
     """
     rows = csv_rows(path)
     header = tuple(cell.strip() for cell in next(rows, (1, []))[1])

@@ -183,13 +183,13 @@ def decode_camera_info(data: bytes) -> CameraModel:
 
 
 def encode_pose(stamp_ns: int, frame: str, T: Transform, covariance: Array) -> bytes:
-    """A geometry_msgs/PoseWithCovarianceStamped.
+    """Encode a geometry_msgs/PoseWithCovarianceStamped.
 
     Args:
-        stamp_ns: since 1970.
-        frame: in which the pose is.
+        stamp_ns: nanoseconds since 1970.
+        frame: frame in which the pose is.
         T: (4, 4) T_frame_body, metres.
-        covariance: (6, 6) of (d, w) in the axes of the frame, m and rad, as ROS has it.
+        covariance: (6, 6) covariance of (d, w) in the axes of the frame, m and rad, as ROS has it.
     """
     out = CdrWriter()
     _write_header(out, stamp_ns, frame)

@@ -34,11 +34,12 @@ from service.core.units import ms, seconds_of_ns
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How a pose may be taken for a time that no message has.
+    """The rule by which a pose may be taken for a time that no message has.
 
     Attributes:
-        within_ns: the nearest message may be so far away.
-        interpolate: between the messages before and after, if these are not farther apart than `most_ns`.
+        within_ns: largest time to the nearest message.
+        interpolate: true to interpolate between the messages before and after, if these are not farther apart than
+            `most_ns`.
         most_ns: see `interpolate`.
     """
 
@@ -98,7 +99,7 @@ class FrameTree:
         return tuple(sorted({*self._edges, *(edge.parent for edge in self._edges.values())}))
 
     def is_static(self, a: str, b: str) -> bool:
-        """Whether two frames do not move against each other. Raises as `pose` does."""
+        """Return whether two frames do not move against each other. Raises as `pose` does."""
         up, down = self._between(a, b)
         return all(self._edges[child].static for child in (*up, *down))
 
@@ -206,12 +207,12 @@ _DAMAGES = (
 
 @dataclass
 class Recording:
-    """What a recording holds, except the images, which are passed on as they are read.
+    """The content of a recording, except the images, which are passed on as they are read.
 
     Attributes:
-        frames: of /tf and /tf_static.
-        poses: by topic of PoseStamped or PoseWithCovarianceStamped, in order of the file.
-        cameras: by topic of CameraInfo: the camera of its first message.
+        frames: transforms of /tf and /tf_static.
+        poses: poses by topic of PoseStamped or PoseWithCovarianceStamped, in order of the file.
+        cameras: the camera of its first message by topic of CameraInfo.
         image_topics: topics of compressed images.
         other: types of the topics that are not read, by topic.
     """
@@ -354,7 +355,7 @@ class _Bounded:
         self._file, self._left = file, size
 
     def read(self, count: int) -> bytes:
-        """At most so many bytes."""
+        """Read `count` bytes at most, and none beyond the size."""
         data = self._file.read(min(count, self._left))
         self._left -= len(data)
         return data

@@ -94,15 +94,15 @@ EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0
 
 @dataclass(frozen=True, slots=True)
 class RegistrationSettings:
-    """What is estimated, by which residual, and the uncertainty of what is given.
+    """The unknowns of a registration, its residual, and the uncertainty of what is given.
 
     Attributes:
         cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
             `algebraic` is the paper's plain x^T E x.
-        robust: whether to weight outlines robustly and exclude outliers.
+        robust: true to weight outlines robustly and exclude outliers.
         pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
             the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
-            "exact": no pose errors; "free": the outlines alone tell where each camera was.
+            "exact": no pose errors; "free": the outlines alone determine where each camera was.
         intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
             errors do not depend on the intrinsics'. None leaves them to the error budget.
         common_errors: prior sizes of errors shared by all outlines of a capture.

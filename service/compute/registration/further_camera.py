@@ -34,7 +34,8 @@ class RigidMean:
         T: (4, 4) T_a_b.
         covariance: (6, 6) of (d, w) of `T`: exp([w]x) R, t + d, m and rad. It follows the scatter of the poses where
             that is larger than their stated covariances.
-        chi2_reduced: of the poses that were kept, against their stated covariances; 1 for a single pose.
+        chi2_reduced: reduced chi square of the poses in the mean against their given covariances; 1 for a single
+            pose.
         kept: (N,) poses that agree with the mean.
         deviations: (N, 6) of (d, w) of every pose from the mean, m and rad.
     """
@@ -47,12 +48,12 @@ class RigidMean:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square distance of the kept poses from the mean."""
+        """Root mean square distance of the poses in the mean from the mean."""
         return _rms(self.deviations[self.kept, :3])
 
     @property
     def rms_rad(self) -> float:
-        """Root mean square angle of the kept poses from the mean."""
+        """Root mean square angle of the poses in the mean from the mean."""
         return _rms(self.deviations[self.kept, 3:])
 
 
@@ -139,8 +140,8 @@ class SightedPose:
         T_scan_camera: (4, 4).
         noise: (6, 6) covariance due to the noise of the outlines, which differs between images.
         common: (6, 6) covariance due to errors of spheres, lens and edges, which many images share.
-        spheres: number of them.
-        rms_px: of their outlines.
+        spheres: number of spheres.
+        rms_px: root mean square residual of their outlines.
     """
 
     T_scan_camera: Transform = field(repr=False)
@@ -155,9 +156,9 @@ class FurtherPose:
     """A further camera in its outer frame: that of the scan, or of the first camera.
 
     Attributes:
-        mean: of the views' poses; its covariance is that of their noise alone.
+        mean: mean of the views' poses; its covariance is that of their noise alone.
         covariance: (6, 6) of the mean, with what is common to the views.
-        names: of the views, in the order of the mean's.
+        names: names of the views, in the order of the mean's.
     """
 
     mean: RigidMean
@@ -181,16 +182,16 @@ class OuterFrame:
 def sighted_pose(
     outlines: Sequence[SphereOutline], camera: CameraModel, spheres: ScanSpheres, lens: Array | None
 ) -> SightedPose:
-    """The pose of a camera from the outlines in one image, which tell which sphere is which.
+    """Compute the pose of a camera from the outlines in one image, which show which sphere is which.
 
     Args:
-        outlines: of the image.
+        outlines: the image's outlines.
         camera: its intrinsics.
-        spheres: in the frame of the scan.
+        spheres: the spheres in the frame of the scan.
         lens: (8, 8) covariance of fx, fy, cx, cy, k1, k2, p1, p2; None: exact.
 
     Raises:
-        ComputeError: too few spheres, or more than one way to tell them apart.
+        ComputeError: too few spheres, or more than one way to identify them.
     """
     (read,) = identify_each([outlines], camera, spheres)
     if read.T_camera_scan is None:

@@ -119,14 +119,14 @@ class Hypothesis:
 def image_hypotheses(
     outlines: Sequence[SphereOutline], centres_scan_m: Array, radius_m: float, camera: CameraModel
 ) -> list[Hypothesis]:
-    """Distinct assignments that explain at least four detections of an image, the best first.
+    """Find distinct assignments that explain at least four detections of an image, the best first.
 
     Triples of detections are paired with all ordered triples of markers whose mutual distances fit (the known radius
     and the apparent size give depth to about one per cent). Each pair gives a pose from the nine parameters of its
     three outlines. Poses that fit must predict a fourth detection, and all further ones. The survivors are solved
     from all their outlines and judged by their residuals in standard deviations.
 
-    The answer does not depend on camera poses, so it is kept for the registrations of the same images with others.
+    The answer does not depend on camera poses, so it is cached for the registrations of the same images with others.
     """
     if len(outlines) < 4 or len(centres_scan_m) < 4:
         return []
@@ -135,7 +135,7 @@ def image_hypotheses(
 
 
 class _Question:
-    """What the hypotheses of an image follow from; equal if all its numbers are."""
+    """The inputs that determine the hypotheses of an image; equal if all its numbers are."""
 
     def __init__(self, seen: Sightings, centres: Array, radius_m: float, focal_px: float) -> None:
         self.seen, self.centres, self.radius_m, self.focal_px = seen, centres, radius_m, focal_px
@@ -181,7 +181,7 @@ def _answered(question: _Question) -> tuple[Hypothesis, ...]:
 
 
 def rivals(readings: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """From assignments sorted best first, select the best and those that contradict it and are nearly as likely."""
+    """Select, from assignments sorted best first, those that contradict the best and are nearly as likely."""
     if not readings:
         return []
     best = readings[0]

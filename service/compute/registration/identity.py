@@ -74,7 +74,7 @@ def identify(
 
     Args:
         outlines: per image; those of other spheres stay unassigned.
-        images: with their poses. If these are not metric, their scale is estimated too.
+        images: the images with their poses. If these are not metric, their scale is estimated too.
         spheres: the registration spheres.
 
     Raises:
@@ -400,9 +400,9 @@ def _words_of_other_scale(
     radius_m: float,
     camera: CameraModel,
 ) -> str:
-    """In which other scale an image shows the list, in words; an empty text if in none.
+    """Describe the other scale in which an image shows the list; an empty text if there is none.
 
-    An image alone cannot tell a list in another scale from another radius of the spheres.
+    An image alone cannot distinguish a list in another scale from another radius of the spheres.
     """
     best: tuple[int, float, int] = (0, 1.0, 0)
     factors = (

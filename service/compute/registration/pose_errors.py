@@ -13,14 +13,14 @@ from service.core.geometry import Array, Transform, skew
 
 
 def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
-    """(6 N, 6 N) joint covariance of `T_scan_camera`, or of `T_scan_camera_refined`.
+    """Compute the (6 N, 6 N) joint covariance of `T_scan_camera`, or of `T_scan_camera_refined`.
 
-    Of (d, w) of each pose: exp([w]x) R, t + d, in the axes of the scan, m and rad. It is whole: the registration's
-    share is in it. Rows of images at stations without outlines are NaN.
+    It is that of (d, w) of each pose: exp([w]x) R, t + d, in the axes of the scan, m and rad. It is whole: the
+    registration's share is in it. Rows of images at stations without outlines are NaN.
 
     With B = T_base_scan of an image's station, R its rotation and a the vector from its origin to the camera,
     d_scan = R^T (d - d_B + a x w_B) and w_scan = R^T (w - w_B), where xi = (d, w) is the error of the pose in its
-    base. The outlines tell of it that xi = xi_0 + K x + own error, with x the error of the common unknowns, whose
+    base. The outlines show that xi = xi_0 + K x + own error, with x the error of the common unknowns, whose
     covariance is C, and own errors of covariance Q. Refined poses have xi_0 taken off. Given ones do not: the
     covariance of their xi is P, and that of xi with x is K C.
 
@@ -84,7 +84,7 @@ def with_joint_pose_covariance(registration: RegistrationResult, covariance: Arr
     ones by their positions: a scale error that moves the scan with all cameras does not count.
 
     Args:
-        registration: of all images in `covariance`, in the same order.
+        registration: the registration of all images in `covariance`, in the same order.
         covariance: (6 N, 6 N) of the poses given to `register` (positions in their unit, rotation vectors), from
             `similarity_covariance`.
 

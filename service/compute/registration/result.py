@@ -223,13 +223,13 @@ def held_out_rows(
 def predict(
     solution: Solution, rows: HeldOutRows, *, refined: bool, centre_covariance_m2: Array | None = None
 ) -> list[Prediction]:
-    """Residuals of outlines, compared with their predicted covariance.
+    """Predict residuals of outlines, and compare them with their predicted covariance.
 
     Args:
-        solution: without these outlines.
-        rows: linearised at the solution.
-        refined: whether the prediction uses the pose corrected by its estimated error, or the pose as given.
-        centre_covariance_m2: (O, 3, 3) of each outline's sphere, scan frame.
+        solution: the solution without these outlines.
+        rows: the outlines' rows, linearised at the solution.
+        refined: true if the prediction uses the pose corrected by its estimated error, false for the pose as given.
+        centre_covariance_m2: (O, 3, 3) covariance of each outline's sphere, scan frame.
     """
     gain, Q = solution.pose_gain()[rows.image], solution.marginal.Q[rows.image]
     spread = solution.covariance

@@ -58,9 +58,9 @@ def register(
     Args:
         outlines: per image, from the detector.
         assignments: per image, outline index → marker index, and an initial pose (from `identify`).
-        images: with their poses; images of one station share a base frame.
+        images: the images with their poses; images of one station share a base frame.
         spheres: the registration spheres.
-        settings: what is estimated, by which residual, and how well the inputs are known.
+        settings: the unknowns, the residual, and how well the inputs are known.
 
     Raises:
         ComputeError: the outlines do not determine the answer, or no convergence.
@@ -113,12 +113,12 @@ class _Iterate:
     """A state with its rows, its objective, and the Gauss–Newton step from it.
 
     Attributes:
-        state: of the common unknowns and the pose errors.
-        rows: of the outlines there.
+        state: state of the common unknowns and the pose errors.
+        rows: rows of the outlines there.
         objective: weighted sum of squares, with the priors.
         dx: (n,) step of the common unknowns.
         poses: (N, 6) pose errors after the whole step.
-        decrement: of the objective by the step, if the problem were linear.
+        decrement: decrease of the objective by the step, if the problem were linear.
     """
 
     state: State
@@ -224,7 +224,7 @@ def _begin(problem: Problem, start: State) -> _Iterate:
 def _robust_weights(
     problem: Problem, here: _Iterate, weighting: _Weighting, keep: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Which outlines to keep (O,), by the median of those kept so far, and the weights (O,), 0 for the rest."""
+    """Select the outlines (O,) by the median of those selected so far, and their weights (O,), 0 for the rest."""
     d, px = _distances(problem, here, weighting)
     typical = float(np.median(px[keep]))
     typical_d = float(np.median(d[keep])) / 1.54  # the median norm of three standard normals
@@ -388,7 +388,7 @@ class PoseNoise:
     """Square roots of the covariances of the pose errors, as a sum of parts with one factor each.
 
     `parts` (K, N, 6, 6) must act on different rows (translation, rotation), or there is only one; `least` is the
-    smallest allowed factor; `free` tells whether the factors are estimated.
+    smallest allowed factor; `free` says whether the factors are estimated.
     """
 
     parts: Array
@@ -406,7 +406,7 @@ def no_pose_noise(n_images: int) -> PoseNoise:
 
 
 def free_poses(n_images: int) -> PoseNoise:
-    """Poses that tell nothing: 0.1 m and 0.1 rad, hundreds of times what the outlines of four spheres leave open."""
+    """Return noise of 0.1 m and 0.1 rad: hundreds of times what the outlines of four spheres leave open."""
     return PoseNoise(np.tile(0.1 * np.eye(6), (1, n_images, 1, 1)), 1.0, free=False)
 
 

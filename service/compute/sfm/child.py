@@ -329,14 +329,14 @@ def adjust(
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> pycolmap.Reconstruction | None:
-    """The adjusted model of the images with an initial pose; None if hardly any observation fits.
+    """Adjust the model of the images with an initial pose; None if hardly any observation fits.
 
     A few tracks are adjusted first, until the poses are within the limit of the final adjustment, in which all tracks
-    take part. Observations are selected anew from all of them before each adjustment, so a rough start loses none.
+    take part. Observations are selected again from all of them before each adjustment, so a rough start loses none.
 
     Args:
         start: initial T_world_camera by image index.
-        features: of all images.
+        features: features of all images.
         sightings: all tracks.
         few: numbers of the tracks that are adjusted first.
         settings: SfmOptions as a dictionary.

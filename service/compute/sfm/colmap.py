@@ -38,10 +38,10 @@ def to_colmap_camera(camera: CameraModel) -> pycolmap.Camera:
 
 
 def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
-    """Our camera from a COLMAP camera.
+    """Convert a COLMAP camera into ours.
 
     Raises:
-        DataError: its model has distortion terms that ours lacks.
+        DataError: its model has distortion terms that ours does not have.
     """
     p = [float(v) for v in camera.params]
     size = (int(camera.width), int(camera.height))
@@ -115,7 +115,7 @@ def extract_sift(grey: NDArray[np.uint8], max_features: int, first_octave: int) 
 
     Args:
         grey: the image.
-        max_features: at most so many.
+        max_features: largest number of features.
         first_octave: -1 doubles the image first, 0 does not.
     """
     extraction = pycolmap.FeatureExtractionOptions()

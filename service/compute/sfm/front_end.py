@@ -36,7 +36,7 @@ class FrontEnd:
             matches += front.match_pairs(features, begun)
 
     with `planned = pairs_of(…)` of the planned poses. At the end, the pairs of the images that did arrive are used:
-    already matched ones are kept, `missing_pairs` of them are matched, and `reconstruct_from` maps.
+    already matched ones are used again, `missing_pairs` of them are matched, and `reconstruct_from` maps.
     """
 
     def __init__(
@@ -188,9 +188,9 @@ class CachedFrontEnd:
     """Features and matches of one camera and one set of options.
 
     Attributes:
-        workspace: existing folder in which they are kept.
+        workspace: existing folder in which they are stored.
         camera: calibrated at the images' size.
-        settings: with which they are computed.
+        settings: settings with which they are computed.
         seconds: wall time of each stage that is run is written here.
     """
 

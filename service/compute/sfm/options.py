@@ -30,11 +30,11 @@ class SfmOptions:
         filter_error_px: observations with larger errors are dropped before the final bundle adjustment.
         min_track: least number of views of a point in the final bundle adjustment.
         loss_px: scale of the final bundle adjustment's robust (Cauchy) loss.
-        threads: of extraction and matching.
-        mapping_threads: of mapping and bundle adjustment. With one, the same features give the same model bit for
-            bit; with more, sums depend on the order in which threads finish.
+        threads: number of threads of extraction and matching.
+        mapping_threads: number of threads of mapping and bundle adjustment. With one, the same features give the same
+            model bit for bit; with more, sums depend on the order in which threads finish.
         refine: intrinsics that the final bundle adjustment may change.
-        seed: of all random choices.
+        seed: seed of all random choices.
         timeout_s: time limit of one stage.
     """
 
@@ -98,16 +98,16 @@ def choose_pairs(
     *,
     stations: Mapping[str, str] | None = None,
 ) -> list[tuple[int, int]]:
-    """Index pairs worth matching: nearest viewing directions around the scene, in one connected graph.
+    """Choose index pairs worth matching: nearest viewing directions around the scene, in one connected graph.
 
     The scene centre is the point nearest to all optical axes. Images without a prior pose are paired with all.
 
     Args:
-        names: of the images.
+        names: names of the images.
         prior: T_world_camera of images; None pairs all with all.
         neighbours: least number of images that each one is paired with.
         max_angle_deg: largest angle between the viewing directions of a pair.
-        stations: frame of each image's prior pose, if there are several; all pairs across frames are kept, since
+        stations: frame of each image's prior pose, if there are several; all pairs across frames are chosen, since
             nothing is known about them.
     """
     if stations is not None and len({stations.get(name) for name in names}) > 1:
@@ -203,7 +203,7 @@ def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int
 class _Parts:
     """The connected parts of a graph that only gains edges.
 
-    SciPy's would cost half a second of imports, and the state of a run is told with these pairs.
+    SciPy's would cost half a second of imports, and the state of a run is reported with these pairs.
     """
 
     def __init__(self, nodes: int) -> None:

@@ -78,8 +78,8 @@ def thinned(sightings: TrackedFeatures, pixels: Array, share: int, pair_share: i
     Args:
         sightings: all tracks.
         pixels: (O, 2) of the observations.
-        share: tracks kept per image, spread over a grid of cells.
-        pair_share: tracks kept per pair of images, if it has as many.
+        share: number of tracks per image, spread over a grid of cells.
+        pair_share: number of tracks per pair of images, if it has as many.
         size: width and height of the images, px.
     """
     length = np.bincount(sightings.track, minlength=sightings.count)
@@ -103,7 +103,7 @@ def thinned(sightings: TrackedFeatures, pixels: Array, share: int, pair_share: i
 def _of_pairs(
     sightings: TrackedFeatures, rank: Index, keep: NDArray[np.bool_], share: int, n_images: int
 ) -> NDArray[np.bool_]:
-    """Tracks that pairs of images need beyond those already kept, so that no weak connection is lost."""
+    """Select tracks that pairs of images need beyond those already selected, so that no weak connection is lost."""
     seen = np.zeros((n_images, sightings.count), dtype=np.bool_)
     seen[sightings.image, sightings.track] = True
     order = np.argsort(rank, kind="stable")

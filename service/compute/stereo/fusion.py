@@ -51,7 +51,7 @@ def fused(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Field:
     """Fuse depth maps.
 
     Args:
-        maps: of one scene.
+        maps: depth maps of one scene.
         voxel_m: edge of a voxel.
         least_maps: blocks that fewer maps have a point in are left out.
 
@@ -196,7 +196,7 @@ def surface_of(found: Field, least_maps: int) -> Surface:
 
 
 def _whole_cells(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where all eight corners of a cell are known, at its last corner, which is where scikit-image looks."""
+    """Find where all eight corners of a cell are known, at its last corner, which is where scikit-image looks."""
     cells = np.zeros_like(known)
     cells[1:, 1:, 1:] = True
     for i, j, k in np.ndindex(2, 2, 2):
@@ -224,7 +224,7 @@ def _tile(
 
 
 def _merged(vertices: NDArray[np.float64], faces: Ints) -> Surface:
-    """With vertices at the same place made one."""
+    """Merge vertices at the same place."""
     keys = np.round(vertices / _ROUND).astype(np.int64)
     _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1)[faces]
@@ -233,7 +233,7 @@ def _merged(vertices: NDArray[np.float64], faces: Ints) -> Surface:
 
 
 def _without_crumbs(surface: Surface) -> Surface:
-    """Without pieces that are much smaller than the largest."""
+    """Drop pieces that are much smaller than the largest."""
     n, faces = len(surface.vertices_m), surface.faces
     rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
     _, piece = connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), (n, n)), directed=False)

@@ -131,7 +131,7 @@ def matched(matcher: cv2.StereoSGBM, left: Image, right: Image, lowest: int) -> 
 
 
 def _without_edges(disparity: Disparity) -> Disparity:
-    """Without pixels at jumps of disparity, where a block covers two surfaces."""
+    """Drop pixels at jumps of disparity, where a block covers two surfaces."""
     filled = np.nan_to_num(disparity, nan=-1e6)
     kernel = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(filled, kernel), cv2.dilate(filled, kernel)

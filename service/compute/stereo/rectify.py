@@ -102,7 +102,7 @@ class Rectified:
         T_world_left, T_world_right: poses of both cameras, whose x runs along the baseline.
         f_px: focal length of both.
         left_px, right_px: x of the principal points; y_px of both.
-        baseline_m: between the cameras.
+        baseline_m: distance between the cameras.
     """
 
     left: NDArray[np.uint8] = field(repr=False)

@@ -49,12 +49,12 @@ class _Opening:
 
 
 def completed(known: Surface, views: Sequence[StereoView], footprint_m: float) -> Surface:
-    """The surface with what it lacks where it is steep, as further faces that do not share its vertices.
+    """Complete a surface where it is steep, by further faces that do not share its vertices.
 
     Args:
         known: the fused surface.
-        views: that it was made from.
-        footprint_m: what a pixel of them covers at the object.
+        views: the views from which it was made.
+        footprint_m: width that a pixel of them covers at the object.
     """
     guess = closed(known)
     seen = RayMesh(known.vertices_m, known.faces)
@@ -126,7 +126,7 @@ def _lowest(belief: NDArray[np.float32], best: Ints, moves_m: Array) -> Array:
 
 
 def _supported(photographs: Sequence[Photograph], points_m: Array, normals: Array, found: Array) -> NDArray[np.bool_]:
-    """Which vertices are steep, have evidence, and are not seen through."""
+    """Return which vertices are steep, have evidence, and are not seen through."""
     second = best_views(photographs, points_m, normals)[1][:, 1]
     return (
         (second > 0)
@@ -137,7 +137,7 @@ def _supported(photographs: Sequence[Photograph], points_m: Array, normals: Arra
 
 
 def _with(known: Surface, vertices_m: Array, faces: Ints, part: _Opening, kept: NDArray[np.bool_]) -> Surface:
-    """The known surface and the faces that have a kept vertex, and else only known ones."""
+    """Return the known surface with the faces that have a vertex in `kept`, and else only known ones."""
     is_kept, usable = (np.zeros(len(vertices_m), dtype=np.bool_) for _ in range(2))
     is_kept[part.vertices[kept]] = True
     usable[part.vertices[kept | part.stays]] = True

@@ -102,7 +102,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 def _words_of_other_scale(a: Array, b: Array, tolerance_m: float) -> str:
-    """In which scale of the one at least five spheres agree, in words; an empty text if in none."""
+    """Describe the scale of the second in which at least five spheres agree; an empty text if there is none."""
     best: Pairs = ()
     for factor in _FACTORS:
         found = _best(a, factor * b, tolerance_m)
@@ -279,7 +279,7 @@ class SphereDifference:
         difference_m: (3,) position in b minus position in a, in frame a.
         sigma_m: standard deviation of the difference along its direction, including the registration's.
         z: Mahalanobis length of the difference.
-        moved: whether the sphere counts as moved.
+        moved: true if the sphere counts as moved.
     """
 
     pair: tuple[int, int]
@@ -294,11 +294,11 @@ class LoopClosure:
     """Comparison of two measurements of one scene.
 
     Attributes:
-        T_a_b: rigid, from the spheres that did not move, weighted by the covariances.
-        spheres: in the order of the match's pairs.
-        chi2_per_dof: of the spheres that did not move; near 1 if the stated uncertainties are right.
-        rms_m: of the differences of the spheres that did not move.
-        sigma_rms_m: predicted rms from the stated uncertainties.
+        T_a_b: rigid transform by the spheres that did not move, weighted by the covariances.
+        spheres: the spheres' differences, in the order of the match's pairs.
+        chi2_per_dof: chi square of the spheres that did not move; near 1 if the given uncertainties are right.
+        rms_m: root mean square difference of the spheres that did not move.
+        sigma_rms_m: predicted rms from the given uncertainties.
         scale: lengths in b over lengths in a, by all spheres: one of two instruments may be calibrated wrongly.
         scale_sigma: its standard deviation.
     """

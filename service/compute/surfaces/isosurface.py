@@ -24,12 +24,12 @@ def surface(
     *,
     slab_voxels: int = SLAB_VOXELS,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """Triangles where the volume crosses a threshold; denser material is inside.
+    """Compute triangles where the volume crosses a threshold; denser material is inside.
 
     Args:
         volume_hu: (K, J, I) Hounsfield units.
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
-        threshold_hu: for example, the middle between air and plastic.
+        threshold_hu: the threshold, such as the middle between air and plastic.
         slab_voxels: approximate limit of voxels processed at a time.
 
     Returns:
@@ -171,15 +171,15 @@ def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Arr
 def sphere_contrasts(
     hounsfield: NDArray[np.int16], T_ct_voxel: Transform, centres_m: Array, radius_m: float
 ) -> Array:
-    """(N,) how much denser each sphere is than what is around it, in HU, signed.
+    """Return (N,) how much denser each sphere is than what is around it, in HU, signed.
 
     Spheres of a segmentation that is mirrored, or of another series, are found where there is none in the volume.
 
     Args:
         hounsfield: (K, J, I).
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
-        centres_m: (N, 3) of the spheres in the CT frame.
-        radius_m: of the spheres.
+        centres_m: (N, 3) centres of the spheres in the CT frame.
+        radius_m: radius of the spheres.
     """
     found = np.empty(len(centres_m))
     sides = np.linalg.norm(T_ct_voxel[:3, :3], axis=0)

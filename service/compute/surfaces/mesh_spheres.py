@@ -421,12 +421,12 @@ def seen_radius(
     *,
     normals: Array | None = None,
 ) -> MeasuredRadius | None:
-    """The radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
+    """Find the radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
 
     Takes as long as a dozen searches. Arguments as for `locate_spheres`; None if there are no such spheres.
 
     Raises:
-        DataError: as `locate_spheres`.
+        DataError: not a mesh, indices out of range, or vertices that are not finite.
     """
     best: tuple[MeshSphere, ...] = ()
     nearest = radius_m
@@ -471,14 +471,14 @@ class WrongUnit:
 
 
 def wrong_unit(vertices_m: Array, faces: NDArray[np.integer], radius_m: float) -> WrongUnit | None:
-    """The mistaken unit with the most spheres of the known radius.
+    """Find the mistaken unit with the most spheres of the known radius.
 
     Only those are tried that give the mesh the size of a scene, so that a mesh of that size takes no time.
 
     Args:
-        vertices_m: (V, 3) as they were read.
+        vertices_m: (V, 3) vertices as they were read.
         faces: (F, 3).
-        radius_m: of the spheres.
+        radius_m: radius of the spheres.
 
     Returns:
         the mistake, or None if no other unit shows three spheres.

@@ -125,13 +125,13 @@ class _Step:
 def rough_centres(
     patches: Surfels, tree: cKDTree, starts: Array, radius: float, min_coverage: float
 ) -> list[Array | None]:
-    """Known-radius fits to the surfels near places (K, 3): a centre (3,) for each, None if they are not a sphere.
+    """Fit spheres of a known radius to the surfels near places (K, 3): a centre (3,) or None for each.
 
     Args:
         patches: the surface.
-        tree: of the surfels' positions.
-        starts: at or near centres, m.
-        radius: of the spheres, m.
+        tree: tree of the surfels' positions.
+        starts: (K, 3) places at or near centres, m.
+        radius: radius of the spheres, m.
         min_coverage: fraction of the whole sphere that will be required of the final fit.
     """
     found: list[Array | None] = [None] * len(starts)

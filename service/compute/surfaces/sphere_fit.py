@@ -110,12 +110,12 @@ LEAST_SPREAD = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Which samples have a weight in a fit.
+    """The rule by which samples have a weight in a fit.
 
     Attributes:
         half_width: residual beyond which a sample has no weight, m.
-        min_cosine: between normal and radius; below it, a sample is not on the sphere.
-        min_samples: below it, there is no fit.
+        min_cosine: least cosine between normal and radius; below it, a sample is not on the sphere.
+        min_samples: least number of samples; below it, there is no fit.
     """
 
     half_width: float
@@ -183,15 +183,15 @@ def fit_centre(
     reach: float,
     most: int,
 ) -> CentreFit | None:
-    """The centre of a sphere; None if its surface is not there, or the centre moves beyond `reach`.
+    """Fit the centre of a sphere; None if its surface is not there, or the centre moves beyond `reach`.
 
     It is a reweighted fit, not least squares of a fixed cost: the band shrinks with the residuals until both settle.
 
     Args:
         surface: samples near the sphere.
         start: (3,) initial centre, m.
-        radius: of the sphere, m.
-        band: which samples count at first.
+        radius: radius of the sphere, m.
+        band: rule that selects the samples at first.
         narrowed: the next half-width after a step, from the step and the present half-width; None: it has settled.
         reach: largest distance of the centre from the start, m.
         most: largest number of steps.

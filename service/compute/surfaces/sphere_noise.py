@@ -38,8 +38,8 @@ class CentreUncertainty:
     """Uncertainty of a sphere fit.
 
     Attributes:
-        covariance: (3, 3) of the centre, m².
-        radius_sigma: of the free radius, m.
+        covariance: (3, 3) covariance of the centre, m².
+        radius_sigma: standard deviation of the free radius, m.
     """
 
     covariance: Array

@@ -36,7 +36,7 @@ class LightGlue:
         return Matches(first_px, second_px, confidence[rows])
 
     def _data(self, features: SiftFeatures, picture: Picture) -> Mapping[str, object]:
-        """What LightGlue reads of an image: lengths in pixels, angles in radians, descriptors of length 1."""
+        """Return LightGlue's inputs for an image: lengths in pixels, angles in radians, descriptors of length 1."""
         descriptors = features.descriptors.astype(np.float32)
         descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), np.float32(1e-6))
         arrays = {

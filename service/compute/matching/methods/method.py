@@ -36,14 +36,14 @@ class Match(Interface):
 
 @dataclass(frozen=True, slots=True)
 class Matcher:
-    """A method.
+    """A matching method.
 
     Attributes:
-        name: as it is named on the command line.
-        words: what it is called in the table.
+        name: its name on the command line.
+        words: its label in the table.
         load: makes it ready, with its weights if it has any. Raises ConfigurationError, which says what to install,
             if something is missing, and DataError if the weights are not its own.
-        weights: the file of its weights, in words; "" if it has none.
+        weights: description of its file of weights; "" if it has none.
     """
 
     name: str

@@ -33,7 +33,7 @@ Weights = Mapping[str, Tensor]
 
 
 class LoadReport(Interface):
-    """What became of the weights."""
+    """The result of loading weights."""
 
     @property
     def missing_keys(self) -> list[str]:

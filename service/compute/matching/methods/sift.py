@@ -18,7 +18,7 @@ FIRST_OCTAVE = -1  # COLMAP's default: the image is doubled first
 
 
 class ExtractedSift:
-    """Features of pictures, kept for the pairs that follow."""
+    """Features of pictures, cached for the pairs that follow."""
 
     def __init__(self) -> None:
         self._known: dict[bytes, SiftFeatures] = {}
