@@ -217,7 +217,7 @@ def hybrid_poses(
     """Adjust tracks, spheres and robot poses together.
 
     Args:
-        images: the images with poses from structure from motion, in any frame and scale, and the camera with which the
+        images: the images with poses from structure from motion, in any frame and scale, and the camera by which the
             outlines were made. Their stations are those of the robot.
         tracks: tracks of the same model.
         outlines: per image, from the detector.
