@@ -72,7 +72,7 @@ class MethodResult:
 
 
 def class_score(name: str, scores: Sequence[PairScore]) -> ClassScore:
-    """The score of some pairs, at least one."""
+    """Return the score of some pairs, at least one."""
     worst = [score.pose.worst_deg for score in scores]
     matches = sum(score.matches for score in scores)
     return ClassScore(
@@ -88,7 +88,7 @@ def class_score(name: str, scores: Sequence[PairScore]) -> ClassScore:
 
 
 def result_of(how: Matcher, folder: Path, data: MatchingData, scores: Sequence[PairScore]) -> MethodResult:
-    """The result of a method on the data set in a folder."""
+    """Return the result of a method on the data set in a folder."""
     sha256 = hashlib.sha256((folder / "pairs.json").read_bytes()).hexdigest()
     return MethodResult(how.name, how.words, sha256, data.simulated, tuple(scores))
 
@@ -128,7 +128,7 @@ class _ResultRecord(_Record):
 
 
 def record(result: MethodResult) -> dict[str, Any]:
-    """The result as plain data; infinite numbers become null."""
+    """Return the result as plain data; infinite numbers become null."""
     pairs = [
         {
             "first": score.first,
@@ -156,7 +156,7 @@ def record(result: MethodResult) -> dict[str, Any]:
 
 
 def read_result(path: Path) -> MethodResult:
-    """A result as `record` wrote it.
+    """Return a result as `record` wrote it.
 
     Raises:
         DataError: the file is something else.
@@ -230,7 +230,7 @@ Epipolar: median over the pairs of the median distance from the epipolar lines."
 
 
 def rows(results: Sequence[MethodResult]) -> list[tuple[str, ...]]:
-    """Rows below HEADER: each method on each class of pairs."""
+    """Return the rows below HEADER: each method on each class of pairs."""
     return [(result.method, *_cells(one)) for result in results for one in result.classes]
 
 
@@ -248,7 +248,7 @@ def _cells(one: ClassScore) -> tuple[str, ...]:
 
 
 def markdown(results: Sequence[MethodResult]) -> str:
-    """The table as Markdown, with what its columns mean."""
+    """Return the table as Markdown, with what its columns mean."""
     lines = ["| " + " | ".join(HEADER) + " |", "|---|---|" + "---:|" * (len(HEADER) - 2)]
     lines += ["| " + " | ".join(row) + " |" for row in rows(results)]
     names = "\n".join(f"- `{result.method}`: {result.words}" for result in results)

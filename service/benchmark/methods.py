@@ -72,7 +72,7 @@ class Method:
 
 
 def methods() -> dict[str, Method]:
-    """Every method by its name.
+    """Return every method by its name.
 
     Raises:
         ConfigurationError: two have the same name, or an entry point names something else.
@@ -81,7 +81,7 @@ def methods() -> dict[str, Method]:
 
 
 def method_named(name: str) -> Method:
-    """The method of this name.
+    """Return the method of this name.
 
     Raises:
         ConfigurationError: there is none.
@@ -124,12 +124,12 @@ _SUGAR_ITERATIONS = "7000"
 
 
 def at(name: str) -> Callable[[Workplace], Path]:
-    """A mesh of this name in the method's folder."""
+    """Return a mesh of this name in the method's folder."""
     return newest(name)
 
 
 def newest(pattern: str) -> Callable[[Workplace], Path]:
-    """The youngest of the files in the method's folder that match a pattern."""
+    """Return the youngest of the files in the method's folder that match a pattern."""
 
     def find(place: Workplace) -> Path:
         found = [path for path in place.work.glob(pattern) if path.is_file()]
@@ -166,7 +166,7 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
 
 
 def triangulation(place: Workplace, dense: Path) -> Command:
-    """The command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
+    """Return command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
     return (place.python, "-m", "service.benchmark.programs.colmap", "triangulate", str(place.data), str(dense))
 
 

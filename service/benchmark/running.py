@@ -86,7 +86,7 @@ def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
 
 
 def this_machine() -> Machine:
-    """The machine that this program runs on."""
+    """Return the machine that this program runs on."""
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -230,7 +230,7 @@ def _require_installed(trial: Trial, commands: tuple[Command, ...]) -> None:
 def _mesh(
     trial: Trial, place: Workplace, commands: tuple[Command, ...], progress: Progress
 ) -> tuple[Path | None, ComputingEffort | None, str]:
-    """The mesh given or made, what it took to make it, and why there is none."""
+    """Return the mesh given or made, what it took to make it, and why there is none."""
     if trial.mesh is not None:
         return trial.mesh, None, ""
     _require_installed(trial, commands)

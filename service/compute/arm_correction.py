@@ -60,7 +60,7 @@ class CorrectedMounting:
     T_flange_camera: Transform
 
     def T_base_camera(self, joints_rad: Array, T_base_flange: Array) -> Array:
-        """(N, 4, 4) camera poses from joints (N, J) and reported poses (N, 4, 4).
+        """Return (N, 4, 4) camera poses from joints (N, J) and reported poses (N, 4, 4).
 
         Raises:
             DataError: joints and poses of another arm.
@@ -69,7 +69,7 @@ class CorrectedMounting:
 
 
 def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction: ArmCorrection) -> Array:
-    """The arm's true poses: reported poses times the difference between corrected and nominal kinematics.
+    """Return the arm's true poses: reported poses times the difference between corrected and nominal kinematics.
 
     Args:
         joints_rad: (J,) or (N, J) as reported by the controller.
@@ -100,7 +100,7 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
 
 
 def _real(arm: ArmModel, joints_rad: Array, correction: ArmCorrection) -> Array:
-    """(N, J, 4 or 5) a, d, α, θ and, where an axis needs it, β of the arm as it is built, at joints (N, J)."""
+    """Return (N, J, 4 or 5) a, d, α, θ and, where an axis needs it, β of the arm as it is built, at joints (N, J)."""
     phase = joints_rad[:, :, None] * np.arange(1, correction.gear_cos_rad.shape[1] + 1)
     gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
     real = np.zeros((*joints_rad.shape, 5))
@@ -126,17 +126,17 @@ def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
 
 
 def dh_count(arm: ArmModel) -> int:
-    """How many parameters the geometry of an arm has in `correction_design`."""
+    """Return how many parameters the geometry of an arm has in `correction_design`."""
     return 4 * arm.axes + len(arm.parallel)
 
 
 def gear_count(arm: ArmModel) -> int:
-    """How many parameters the gears of an arm have in `correction_design`."""
+    """Return how many parameters the gears of an arm have in `correction_design`."""
     return arm.axes * 2 * arm.tolerances.harmonics
 
 
 def dh_joints(arm: ArmModel) -> NDArray[np.int64]:
-    """(`dh_count`,) joint of each parameter of the geometry, from 0."""
+    """Return (`dh_count`,) joint of each parameter of the geometry, from 0."""
     return np.concatenate([np.repeat(np.arange(arm.axes), 4), np.array(arm.parallel, dtype=np.int64)])
 
 

@@ -20,7 +20,7 @@ _SAME_TOOL_M, _SAME_TOOL_RAD = 0.01, 0.01  # between the tools of most poses, if
 
 
 def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:
-    """The arm whose forward kinematics fit the reported poses best; None if none is within `within_m`.
+    """Return the arm whose forward kinematics fit the reported poses best; None if none is within `within_m`.
 
     Of arms with the same dimensions, such as KUKA's LBR iiwa 14 and LBR Med 14, it is the first.
 
@@ -39,7 +39,7 @@ def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0
 
 
 def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transform] | None:
-    """The arm and its tool T_flange_tool whose poses these are; None if no known arm with one fixed tool has them.
+    """Return arm and its tool T_flange_tool whose poses these are; None if no known arm with one fixed tool has them.
 
     Args:
         joints_rad: (N, J).
@@ -86,12 +86,12 @@ def chain(values: Array) -> Array:
 
 
 def forward(arm: ArmModel, joints_rad: Array) -> Array:
-    """(N, 4, 4) T_base_flange at joints (N, J) with the nominal parameters."""
+    """Return (N, 4, 4) T_base_flange at joints (N, J) with the nominal parameters."""
     return chain(arm.joint_values(_joints(arm, joints_rad)))[:, -1]
 
 
 def dh_jacobian(frames: Array) -> Array:
-    """(N, 6, 4 J) derivative of the flange's pose by a, d, α, θ of joint 1, of joint 2, …
+    """Return (N, 6, 4 J) derivative of the flange's pose by a, d, α, θ of joint 1, of joint 2, …
 
     The pose increment is (d in metres, w in radians) in the flange's axes, about its origin.
 
@@ -174,7 +174,7 @@ class _Reach:
 
 
 def pose_gap(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> tuple[float, float]:
-    """Median distance (m) and angle (rad) between forward kinematics and the reported poses (N, 4, 4).
+    """Return the median distance (m) and angle (rad) between forward kinematics and the reported poses (N, 4, 4).
 
     Raises:
         DataError: the numbers of joints and poses differ.
@@ -201,7 +201,7 @@ _WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.25])
 
 
 def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
-    """Joints (K, N) within ±180° and the limits that reach a pose; an empty array if there are none.
+    """Return the joints (K, N) within ±180° and the limits that reach a pose; an empty array if there are none.
 
     Up to eight for six axes; for seven, those of elbow angles all round.
     """
@@ -212,7 +212,7 @@ def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
 
 
 def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
-    """Joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
+    """Return the joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
 
     The turn of the last of six axes counts half. With seven axes nearness is weighed against room to limits and
     singularities.
@@ -227,13 +227,13 @@ def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> A
 
 
 def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
-    """The first of `postures_near`; None if the pose is out of reach."""
+    """Return the first of `postures_near`; None if the pose is out of reach."""
     found = postures_near(arm, T_base_flange, near_rad)
     return found[0] if len(found) else None
 
 
 def _universal_robot(arm: ArmModel, T_base_flange: Transform) -> Array:
-    """Joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
+    """Return the joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
 
     The eight are shoulder left or right, wrist up or down, elbow up or down. Where the last axis is parallel to the
     second, its angle is free and taken as 0.

@@ -19,7 +19,7 @@ StateT = TypeVar("StateT")
 
 
 def largest(step: Array) -> float:
-    """Largest absolute coordinate of a step."""
+    """Return the largest absolute coordinate of a step."""
     return float(np.abs(step).max())
 
 

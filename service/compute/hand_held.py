@@ -113,7 +113,7 @@ def look_at_image(
 def _read(
     outlines: Sequence[SphereOutline], camera: CameraModel, spheres_m: Array, radius_m: float
 ) -> Transform | None:
-    """T_camera_scene from the assignment on which the spheres agree; None if there is none."""
+    """Return T_camera_scene from the assignment on which the spheres agree; None if there is none."""
     if len(outlines) < _LEAST_SPHERES:
         return None
     try:
@@ -218,7 +218,7 @@ class ImageReading:
         )
 
     def of_spheres(self, numbers: NDArray[np.int64]) -> ImageReading:
-        """The reading with these spheres only."""
+        """Return the reading with these spheres only."""
         kept = np.isin(self.spheres, numbers)
         return replace(
             self,
@@ -229,7 +229,7 @@ class ImageReading:
         )
 
     def record(self) -> dict[str, Any]:
-        """The reading as plain data, as `read` takes it."""
+        """Return the reading as plain data, as `read` takes it."""
         return {
             "spheres": self.spheres.tolist(),
             "axes": self.axes.tolist(),
@@ -250,7 +250,7 @@ class ImageReading:
         )
 
     def photograph(self, camera: CameraModel) -> SpherePhotograph:
-        """The reading as input of the adjustment."""
+        """Return the reading as input of the adjustment."""
         cones = tuple(Cone(axis, float(half)) for axis, half in zip(self.axes, self.half_angles_rad, strict=True))
         return SpherePhotograph(camera, cones, self.covariances)
 
@@ -314,7 +314,7 @@ def adjust_together(
 
 
 def _worst_sigma_m(centres_m: Array, covariance: Array, scale_sigma: float) -> float:
-    """Worst standard deviation of the shape alone, without position and rotation of the whole.
+    """Return the worst standard deviation of the shape alone, without position and rotation of the whole.
 
     The spheres' radius is the only length in the images, so outlines that are all too wide make the whole too small.
     """

@@ -65,7 +65,7 @@ class ProvisionalRegistration:
 
 
 def expected_spheres(T_camera_scan: Transform, spheres_m: Array, radius_m: float, camera: CameraModel) -> list[int]:
-    """Indices of the spheres (M, 3) whose whole outline lies in the image, ignoring occlusion."""
+    """Return the indices of the spheres (M, 3) whose whole outline lies in the image, ignoring occlusion."""
     centres = apply(T_camera_scan, spheres_m)
     distance = np.linalg.norm(centres, axis=1)
     front = (centres[:, 2] > 0.3 * distance) & (distance > 2 * radius_m)
@@ -120,7 +120,7 @@ def register_station(
 
 
 def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel) -> Sharpness:
-    """Width of the luma step across the outlines, and the outlines' own quality.
+    """Return the width of the luma step across the outlines, and the outlines' own quality.
 
     The width of an edge is its height over its steepest slope, in pixels; about 1.5 in a sharp image.
     """
@@ -151,7 +151,7 @@ def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
 def image_measures(
     image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel
 ) -> tuple[dict[str, float], bool]:
-    """Measures of an image (H, W, 3) as it arrives, by name, some NaN; and whether it is black."""
+    """Return the measures of an image (H, W, 3) as it arrives, by name, some NaN; and whether it is black."""
     quality = sharpness(image_bgr, outlines, camera)
     whole = image_quality(np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
     measures = {

@@ -82,7 +82,7 @@ class PipelineResult:
         return tuple(Assignment() for _ in self.images) if self.controls is None else self.controls.assignments
 
     def measures(self) -> dict[str, float]:
-        """The figures that gates judge, by their names in a run."""
+        """Return the figures that gates judge, by their names in a run."""
         out = {
             "predicted_error_mm": mm(self.registration.sigma_at_m(self.centre_scan_m)),
             "contradictions": float(sum(one.refuses for one in self.findings)),
@@ -94,7 +94,7 @@ class PipelineResult:
         return out
 
     def as_json(self, camera: CameraModel) -> dict[str, object]:
-        """The content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
+        """Return the content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
         r = self.registration
         return {
             "T_world_scan": r.T_world_scan.tolist(),
@@ -268,14 +268,14 @@ def register_images(
 
 
 def _without(T_scan_camera: Array, left_out: Mapping[int, str]) -> Array:
-    """The poses, with NaN for images that were left out."""
+    """Return the poses, with NaN for images that were left out."""
     out = T_scan_camera.copy()
     out[list(left_out)] = np.nan
     return out
 
 
 def _with_component(registration: RegistrationResult, name: str, part: Array) -> RegistrationResult:
-    """The registration with a further (6, 6) part of its covariance; unchanged if the part is zero."""
+    """Return the registration with a further (6, 6) part of its covariance; unchanged if the part is zero."""
     if not part.any():
         return registration
     whole = np.zeros_like(registration.covariance)

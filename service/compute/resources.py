@@ -45,13 +45,13 @@ def machine_memory(root: Path = Path("/")) -> MachineMemory:
 
 
 def processes_for(items: int, each_mb: float, memory: MachineMemory | None = None) -> int:
-    """The number of processes that share this work: one a core, as long as they fit into half of the memory."""
+    """Return number of processes that share this work: one a core, as long as they fit into half of the memory."""
     fit = int(0.5 * (memory or machine_memory()).total_mb / each_mb)
     return max(1, min(items, os.cpu_count() or 1, fit))
 
 
 def _groups(root: Path) -> Iterator[tuple[int, int]]:
-    """Limit and use, in bytes, of each group that confines this process (cgroups, version 1 and 2)."""
+    """Yield the limit and use, in bytes, of each group that confines this process (cgroups, version 1 and 2)."""
     try:
         lines = (root / "proc/self/cgroup").read_text(encoding="ascii").splitlines()
     except OSError:  # not Linux

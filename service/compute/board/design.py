@@ -41,7 +41,7 @@ class Candidates:
     pixels: Array
 
     def take(self, which: NDArray[np.int64]) -> Candidates:
-        """Only the candidates with these indices."""
+        """Return only the candidates with these indices."""
         return Candidates(self.T_base_camera[which], self.pixels[which])
 
 
@@ -55,7 +55,7 @@ def board_candidates(
     seed: int = 0,
     draw: int = 0,
 ) -> Candidates:
-    """Poses that keep the whole printed board in the frame for every truth within the tolerances.
+    """Return poses that keep the whole printed board in the frame for every truth within the tolerances.
 
     Args:
         known: nominal values or estimates, with their tolerances.
@@ -83,14 +83,14 @@ def board_candidates(
 
 
 def expected_pixels(known: BoardKnowledge, board: Board, T_base_camera: Array) -> Array:
-    """(C, P, 2) pixels of the board's points for the estimated camera, mount and board."""
+    """Return (C, P, 2) pixels of the board's points for the estimated camera, mount and board."""
     boards = np.array([inverse(T) @ known.T_base_board for T in T_base_camera]).reshape(-1, 4, 4)
     points = np.einsum("nij,pj->npi", boards[:, :3, :3], board.points()) + boards[:, None, :3, 3]
     return known.camera.project(points.reshape(-1, 3)).reshape(len(boards), len(board.points()), 2)
 
 
 def _outline(board: Board) -> Array:
-    """(8, 3) edge of the printed squares in the board frame; it lies one square beyond the inner corners."""
+    """Return (8, 3) edge of the printed squares in the board frame; it lies one square beyond the inner corners."""
     points = board.points()[:, :2]
     low, high = points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
     share = [(0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5)]
@@ -108,7 +108,7 @@ class _ToleranceDraws:
         self.outline_base = np.array([apply(board, outline) for board in boards])  # (D, K, 3)
 
     def pixels(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """(C, D, K, 2) pixels of the outline and (C, D, K) its depths, m."""
+        """Return (C, D, K, 2) pixels of the outline and (C, D, K) its depths, m."""
         R = T_base_camera[:, :3, :3]
         moved = self.outline_base[None] - T_base_camera[:, None, None, :3, 3]
         sent = np.einsum("cji,cdkj->cdki", R, moved)
@@ -216,7 +216,7 @@ class ChosenViews:
     pixels: tuple[Array, ...] = ()
 
     def plus(self, poses: Array, pixels: Sequence[Array]) -> ChosenViews:
-        """These with further ones."""
+        """Return these with further ones."""
         return ChosenViews(np.concatenate([self.T_base_camera, poses.reshape(-1, 4, 4)]), (*self.pixels, *pixels))
 
 
@@ -238,7 +238,7 @@ class DesignProblem:
     aims: CalibrationTargets
 
     def as_taken(self, T_base_camera: Array) -> ChosenViews:
-        """Poses (K, 4, 4) as if their images were taken, with the board's points at their expected pixels."""
+        """Return poses (K, 4, 4) as if their images were taken, with the board's points at their expected pixels."""
         poses = T_base_camera.reshape(-1, 4, 4)
         return ChosenViews(poses, tuple(expected_pixels(self.known, self.board, poses)))
 
@@ -318,7 +318,7 @@ def choose_poses(
 
 
 def _first(ranked: NDArray[np.int64], open_: NDArray[np.bool_], feasible: Callable[[int], bool]) -> int | None:
-    """The first feasible candidate, or None; it and those before it are no longer open."""
+    """Return the first feasible candidate, or None; it and those before it are no longer open."""
     for k in ranked.tolist():
         open_[k] = False
         if feasible(k):
@@ -335,7 +335,7 @@ class _InformationGain:
         self.field = lens_field(problem.known.camera)
 
     def gains(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """(C, 8, 8) of the camera and (C, 12, 12) of mount and board."""
+        """Return (C, 8, 8) of the camera and (C, 12, 12) of mount and board."""
         count = len(T_base_camera)
         lens = np.zeros((count, *self.prior.shape))
         mount = np.zeros((count, 12, 12))
@@ -359,7 +359,7 @@ class _InformationGain:
         return so_far[0] + gains[0][k], so_far[1] + gains[1][k]
 
     def cost(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], pool: NDArray[np.int64]) -> Array:
-        """(K,) logarithm of the variance left after adding each candidate of the pool."""
+        """Return (K,) logarithm of the variance left after adding each candidate of the pool."""
         cost = np.zeros(len(pool))
         if self.aims.intrinsics:
             covariance = inverse_of(so_far[0] + gains[0][pool])
@@ -373,7 +373,7 @@ class _InformationGain:
 
 
 def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.bool_]:
-    """(C, 96) whether each cell holds a corner of (C, P, 2) within the inner share of its sides."""
+    """Return (C, 96) whether each cell holds a corner of (C, P, 2) within the inner share of its sides."""
     if not len(pixels):
         return np.zeros((0, COVERAGE_GRID[0] * COVERAGE_GRID[1]), dtype=bool)
     place = (pixels + 0.5) / [known.camera.width, known.camera.height] * COVERAGE_GRID
@@ -385,19 +385,19 @@ def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.boo
 
 
 def _covered(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.bool_]:
-    """(96,) whether each cell holds a corner of images that count already."""
+    """Return (96,) whether each cell holds a corner of images that count already."""
     return _counts(pixels, known).ravel() > 0
 
 
 def _counts(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.int64]:
-    """(8, 12) corners in each cell."""
+    """Return (8, 12) corners in each cell."""
     if not pixels:
         return np.zeros(COVERAGE_GRID[::-1], dtype=np.int64)
     return coverage_map_of(pixels, (known.camera.width, known.camera.height))
 
 
 def _spread_deg(boards: Array) -> float:
-    """Largest rotation between two views, degrees."""
+    """Return the largest rotation between two views, degrees."""
     if len(boards) < 2:
         return 0.0
     turns = Rotation.from_matrix(boards[:, :3, :3])

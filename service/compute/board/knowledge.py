@@ -172,13 +172,13 @@ def refined_knowledge(
 def _posterior(
     known: BoardKnowledge, prior_board: Transform, hands: Array, boards: Array, C: Array
 ) -> tuple[Transform, Transform, Array]:
-    """Posterior T_flange_camera and T_base_board, and their covariance (12, 12)."""
+    """Return the posterior T_flange_camera and T_base_board, and their covariance (12, 12)."""
     precision = np.linalg.inv(known.spread @ known.spread.T / 3 + 1e-16 * np.eye(12))
     mount0 = known.T_flange_camera
     noise = np.diag([_ARM_M**2] * 3 + [_ARM_RAD**2] * 3)
 
     def minimum_at(mount: Transform, board: Transform) -> tuple[Array, Array]:
-        """Step (12,) and covariance (12, 12)."""
+        """Return the step (12,) and covariance (12, 12)."""
         e, J, JM = linearise(hands, boards, mount, board)
         V = np.linalg.inv(noise + JM @ C @ np.swapaxes(JM, 1, 2))
         H = np.einsum("nia,nij,njb->ab", J, V, J) + precision
@@ -200,13 +200,13 @@ def _posterior(
 
 
 def _from(start: Transform, end: Transform) -> Array:
-    """(6,) increment (d, w) that takes `start` to `end`."""
+    """Return (6,) increment (d, w) that takes `start` to `end`."""
     w = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
     return np.concatenate([end[:3, 3] - start[:3, 3], w])
 
 
 def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tuple[CameraModel, float, float]:
-    """A lens from the first images if it is plausible: near the nominal one, and with moderate distortion."""
+    """Return a lens from the first images if it is plausible: near the nominal one, and with moderate distortion."""
     size = (known.camera.width, known.camera.height)
     try:
         found = calibrate_intrinsics(views, board, size, model="radial2").camera
@@ -245,7 +245,7 @@ _EVERY = 2  # use every second corner of rows and columns; more would only avera
 
 
 def lens_prior(camera: CameraModel) -> Array:
-    """(8, 8) prior information from the nominal values."""
+    """Return (8, 8) prior information from the nominal values."""
     scale = np.array([camera.fx, camera.fy, camera.width, camera.width, 1, 1, 1, 1])
     return np.diag(1 / (np.array(_PRIOR_SIGMA) * scale) ** 2)
 
@@ -277,7 +277,7 @@ def lens_field(camera: CameraModel) -> Array:
 
 
 def hand_eye_information(T_base_camera: Array, known: BoardKnowledge, board: Board, corner_sigma_px: float) -> Array:
-    """(C, 12, 12) information of each pose about T_flange_camera and T_base_board."""
+    """Return (C, 12, 12) information of each pose about T_flange_camera and T_base_board."""
     points = board.points()
     corners = points.reshape(board.rows, board.columns, 3)[:: board.rows - 1, :: board.columns - 1].reshape(-1, 3)
     share = len(points) / len(corners)
@@ -314,7 +314,7 @@ def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigm
 
 
 def inverse_of(information: Array) -> Array:
-    """(N, K, K) inverses of positive definite matrices, scaled first because their units differ widely."""
+    """Return (N, K, K) inverses of positive definite matrices, scaled first because their units differ widely."""
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return np.linalg.inv(information * both) * both

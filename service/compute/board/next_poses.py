@@ -108,7 +108,7 @@ def suggest_board_poses(
 
 
 def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, camera: CameraModel) -> Array:
-    """(C, 4, 4) camera poses around the board with the whole board in the image."""
+    """Return (C, 4, 4) camera poses around the board with the whole board in the image."""
     centre_board = points_m.mean(axis=0)
     eyes = (T_base_camera @ np.array([0.0, 0.0, 0.0, 1.0]))[:, :3]
     centre = T_base_board[:3, :3] @ centre_board + T_base_board[:3, 3]
@@ -161,7 +161,7 @@ class _Model:
         return cls(answer.T_flange_camera, answer.T_base_board, points_m, camera, corner_sigma_px, robot)
 
     def information(self, flanges: Array) -> Array:
-        """(N, 12, 12) information of each pose (N, 4, 4) about T_flange_camera and T_base_board."""
+        """Return (N, 12, 12) information of each pose (N, 4, 4) about T_flange_camera and T_base_board."""
         if len(flanges) == 0:
             return np.zeros((0, 12, 12))
         X, B = self.T_flange_camera, self.T_base_board
@@ -178,7 +178,7 @@ class _Model:
 
 
 def _covariance_of(information: Array) -> Array:
-    """(C, 6, 6) covariance of T_flange_camera from joint information (C, 12, 12)."""
+    """Return (C, 6, 6) covariance of T_flange_camera from joint information (C, 12, 12)."""
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return (np.linalg.inv(information * both) * both)[:, :6, :6]
@@ -260,7 +260,7 @@ def _panel(
 
 
 def _frustum(T: Transform, camera: CameraModel) -> Array:
-    """(5, 3) camera centre and the four image corners, the top edge first."""
+    """Return (5, 3) camera centre and the four image corners, the top edge first."""
     x, y = camera.width / camera.fx / 2, camera.height / camera.fy / 2
     rays = np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]) * _DEPTH_M
     return apply(T, rays)

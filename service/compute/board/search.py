@@ -104,7 +104,7 @@ def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:
 
 
 def usable_views(found: Sequence[BoardImage]) -> UsableViews:
-    """Views in the most common image size; the others are excluded with reasons.
+    """Return the views in the most common image size; the others are excluded with reasons.
 
     Raises:
         ComputeError: the board is in no image.
@@ -248,7 +248,7 @@ def _too_little(count: int) -> ComputeError:
 
 
 def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> float:
-    """Largest possible distance of the corners from their predicted positions, px, from random draws."""
+    """Return the largest possible distance of the corners from their predicted positions, px, from random draws."""
     hands, boards, _, _ = known.draws(_DRAWS)
     flange = T_base_camera @ inverse(known.T_flange_camera)
     ends = board.points()[[0, board.columns - 1, -board.columns, -1]]
@@ -263,7 +263,7 @@ def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> 
 def _crossings(
     image: Grey, grid: Array, which: NDArray[np.int64], found: Array, *, dark_first: bool
 ) -> NDArray[np.bool_]:
-    """(M,) whether two dark and two bright squares meet at each corner, as on the board.
+    """Return (M,) whether two dark and two bright squares meet at each corner, as on the board.
 
     With `dark_first`, the board's first square is dark (the order in which `find_board` numbers it), so a grid that
     is off by one square has the wrong colours.
@@ -287,7 +287,7 @@ def _crossings(
 
 
 def _one_plane(view: BoardView, board: Board, known: BoardKnowledge) -> BoardView:
-    """The view without corners that do not fit one common board pose."""
+    """Return the view without corners that do not fit one common board pose."""
     points = board.points()
     for _ in range(3):
         pose, _ = fit_pose(view, points, known.camera, start_pose(view, points, known.camera))

@@ -102,7 +102,7 @@ class ControlEvaluation:
         return tuple(s.finding for s in self.spheres if s.finding)
 
     def measures(self) -> dict[str, float]:
-        """The figures that gates judge, by their names in a run."""
+        """Return the figures that gates judge, by their names in a run."""
         out = {
             "control_spheres": float(self.measured),
             "control_spheres_expected": float(len(self.spheres)),
@@ -200,7 +200,7 @@ def _evaluated(
 
 
 def _told(row: ControlSphere, off: dict[int, Array]) -> ControlSphere:
-    """The row with its finding."""
+    """Return the row with its finding."""
     finding, name = "", f"control sphere {row.index}"
     if not row.measured:
         finding = (
@@ -237,7 +237,7 @@ def _told(row: ControlSphere, off: dict[int, Array]) -> ControlSphere:
 def _captures_shown(
     places: dict[int, SeenPlace], capture: NDArray[np.int64], expected: dict[int, list[int]]
 ) -> set[int]:
-    """The captures in which control spheres were placed: those that show one, or all if none does."""
+    """Return the captures in which control spheres were placed: those that show one, or all if none does."""
     out: set[int] = set()
     for c in set(capture.tolist()):
         for s, place in places.items():
@@ -328,7 +328,7 @@ class SeenSpheres:
                 self.outlines[image].append(outline)
 
     def places(self, expected: dict[int, list[int]]) -> dict[int, SeenPlace]:
-        """The place of each control sphere that images show, by its index."""
+        """Return the place of each control sphere that images show, by its index."""
         rays = self._rays()
         seen: list[SeenPlace] = []
         left = np.ones(len(rays.image), dtype=bool)
@@ -351,7 +351,7 @@ class SeenSpheres:
         return {int(s): seen[k] for s, k in zip(rows, columns, strict=True) if cost[s, k] < 1.0}
 
     def _rays(self) -> _Rays:
-        """The free outlines that may be control spheres: near one of them, of its size."""
+        """Return the free outlines that may be control spheres: near one of them, of its size."""
         image: list[int] = []
         outline: list[int] = []
         for i, found in enumerate(self.outlines):
@@ -380,12 +380,12 @@ class SeenSpheres:
 
     @staticmethod
     def _nearest(rays: _Rays, points: Array) -> Array:
-        """(P, K, 3) the point of each ray nearest to each of (P, 3) points."""
+        """Return (P, K, 3) the point of each ray nearest to each of (P, 3) points."""
         along = np.einsum("pki,ki->pk", points[:, None, :] - rays.origin[None], rays.direction)
         return rays.origin[None] + along[..., None] * rays.direction[None]
 
     def _best(self, rays: _Rays, left: NDArray[np.bool_]) -> SeenPlace | None:
-        """The place that most images see, by the outlines left; of equal ones, where they agree best."""
+        """Return the place that most images see, by the outlines left; of equal ones, where they agree best."""
         which = np.flatnonzero(left)
         mine = _Rays(
             rays.image[which], rays.outline[which], rays.origin[which], rays.direction[which], rays.half[which]
@@ -436,7 +436,7 @@ class SeenSpheres:
 
 
 def _crossings(rays: _Rays, radius_m: float) -> Array:
-    """(P, 3) where pairs of rays of two images pass each other closely."""
+    """Return (P, 3) where pairs of rays of two images pass each other closely."""
     a, b = np.triu_indices(len(rays.image), 1)
     other = rays.image[a] != rays.image[b]
     a, b = a[other], b[other]

@@ -52,7 +52,7 @@ class Alignment:
     covariance: Array = field(repr=False)
 
     def covariance_at_m2(self, points_b_m: Array) -> Array:
-        """(n, 3, 3) covariance, in the axes of a, that the alignment's error adds to points (n, 3) of b."""
+        """Return (n, 3, 3) covariance, in the axes of a, that the alignment's error adds to points (n, 3) of b."""
         J = place_jacobian(points_b_m @ self.T_a_b[:3, :3].T)
         return J @ self.covariance @ J.transpose(0, 2, 1)
 
@@ -66,7 +66,7 @@ def locate_in_images(
     *,
     least_images: int = 3,
 ) -> dict[int, TriangulatedSphere]:
-    """Centres of spheres from their outlines and the registered cameras, each sphere on its own.
+    """Return the centres of spheres from their outlines and the registered cameras, each sphere on its own.
 
     Weighted least squares of the cones' three parameters (`ObservedCones`); outlines more than 4 sigma from the
     others of their sphere are excluded. The covariance follows from the outlines', inflated if they scatter more.
@@ -276,7 +276,7 @@ def contributions(
 def control_observation(
     registration: Alignment, seen: Mapping[int, TriangulatedSphere], control: MeasuredSpheres
 ) -> Observation:
-    """Control spheres located in the images, compared with their positions by scan and registration.
+    """Return the control spheres located in the images, compared with their positions by scan and registration.
 
     Control and registration spheres are seen by the same camera, so an error that moves all outlines alike moves both
     and cancels.
@@ -302,7 +302,7 @@ def control_observation(
 def loop_observations(
     seen: Mapping[int, TriangulatedSphere], scan: MeasuredSpheres, ct_in_scan_order: MeasuredSpheres | None
 ) -> tuple[Observation, ...]:
-    """Closures camera ↔ scan, scan ↔ CT and camera ↔ CT: shapes of the spheres that each pair shares.
+    """Return the closures camera ↔ scan, scan ↔ CT and camera ↔ CT: shapes of the spheres that each pair shares.
 
     Three pairs instead of one loop, because alignments on the same spheres cancel one another whatever their errors.
 

@@ -66,7 +66,7 @@ class BlockedSamples:
         return tuple(min(_BLOCK, self.n - begin) for begin in range(0, self.n, _BLOCK))
 
     def blocks(self, some: Sequence[IntArray] | None = None) -> Iterator[Samples]:
-        """All samples in order, in blocks of up to a million; the same ones each time.
+        """Yield all samples in order, in blocks of up to a million; the same ones each time.
 
         `some` chooses from each block by their numbers in it (K,), in order; a block of which none is wanted is left
         out.
@@ -85,7 +85,7 @@ class BlockedSamples:
             yield Samples(_places(self._surface, origin, drawn if some is None else drawn[:, chosen]), origin, None)
 
     def regions(self) -> Iterator[Samples]:
-        """All samples, those together that lie together, without normals; a region is larger than a block.
+        """Yield all samples, those together that lie together, without normals; a region is larger than a block.
 
         In a file whose faces have no spatial order, each block is spread over the whole surface.
         """
@@ -131,7 +131,7 @@ def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
 
 
 def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:
-    """All samples of a surface at once. Raises as BlockedSamples."""
+    """Return all samples of a surface at once. Raises as BlockedSamples."""
     blocks = list(BlockedSamples(surface, spacing_m, rng).blocks())
     normals = [block.normals for block in blocks if block.normals is not None]
     return Samples(
@@ -142,7 +142,7 @@ def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samp
 
 
 def _counts(surface: Surface, spacing_m: float, rng: np.random.Generator) -> IntArray:
-    """(F,) number of samples on each face and those before it."""
+    """Return (F,) number of samples on each face and those before it."""
     area = surface.face_areas_m2
     total = area.sum() / spacing_m**2
     if not total > 0:
@@ -160,7 +160,7 @@ def _counts(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Int
 
 
 def random_points(surface: Surface, n: int, rng: np.random.Generator) -> Array:
-    """(n, 3) points of a mesh, independent of one another and uniform in area."""
+    """Return (n, 3) points of a mesh, independent of one another and uniform in area."""
     share = np.cumsum(surface.face_areas_m2)
     chosen = np.searchsorted(share, rng.random(n) * share[-1], side="right")
     return random_places(surface, np.minimum(chosen, len(share) - 1), rng)
@@ -174,12 +174,12 @@ def normals_at(surface: Surface, origin: IntArray) -> Array | None:
 
 
 def random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
-    """(K, 3) one random point on each of these faces (K,)."""
+    """Return (K, 3) one random point on each of these faces (K,)."""
     return _places(surface, faces, rng.random((2, len(faces))))
 
 
 def _places(surface: Surface, faces: IntArray, drawn: Array) -> Array:
-    """(K, 3) the point on each of these faces (K,) that two numbers drawn from 0 to 1 (2, K) stand for."""
+    """Return (K, 3) the point on each of these faces (K,) that two numbers drawn from 0 to 1 (2, K) stand for."""
     out = np.empty((len(faces), 3))
     for begin in range(0, len(faces), _PLACES):
         of, (u, v) = faces[begin : begin + _PLACES], drawn[:, begin : begin + _PLACES]
@@ -345,7 +345,7 @@ def chamfer(pred: Surface, gt: Surface, settings: ChamferSettings | None = None)
 
 
 def _compared(samples: BlockedSamples, seed: int) -> Samples:
-    """The samples whose distances are measured: all, or MOST_COMPARED at random, the same share of each block."""
+    """Return samples whose distances are measured: all, or MOST_COMPARED at random, the same share of each block."""
     rng = np.random.default_rng([seed, samples.n])  # of its own: the other draws do not depend on it
     share = min(1.0, MOST_COMPARED / samples.n)
     some: list[IntArray] | None = None
@@ -363,7 +363,7 @@ def _compared(samples: BlockedSamples, seed: int) -> Samples:
 def _nearest(
     targets: BlockedSamples, some: Samples, queries: tuple[Array, Array, Array], outlier_m: float
 ) -> tuple[NearestOfBlocks, NearestOfBlocks, NearestOfBlocks]:
-    """The nearest of all samples of a surface for three sets of queries (Q, 3), by the face or point they are on.
+    """Return nearest of all samples of a surface for three sets of queries (Q, 3), by the face or point they are on.
 
     The second set lies on that surface itself, and has no limit. `some` of the samples are looked at first.
     """
@@ -438,7 +438,7 @@ def _consistency(way: _Way, chosen: IntArray) -> float | None:
 
 
 def _floor_places(surface: Surface, samples: BlockedSamples, rng: np.random.Generator) -> Array:
-    """Random places (N, 3) of a surface, whose mean distance from its nearest samples is the floor."""
+    """Return random places (N, 3) of a surface, whose mean distance from its nearest samples is the floor."""
     n = min(CHECKED, samples.n)
     if surface.is_mesh:
         return random_points(surface, n, rng)

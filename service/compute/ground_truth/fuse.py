@@ -96,7 +96,7 @@ def _deviation_field(
 
 
 def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = None) -> tuple[Surface, int]:
-    """The surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
+    """Return the surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
 
     Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
     neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
@@ -138,7 +138,7 @@ def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = N
 
 
 def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -> tuple[Array, IntArray]:
-    """(V,) share with which each vertex moves as a part of its piece, and (V,) the piece's number.
+    """Return (V,) share with which each vertex moves as a part of its piece, and (V,) the piece's number.
 
     The share is 1 at the corners of the folded faces and their neighbours, and passes to 0 over `rings` rings.
     """
@@ -153,7 +153,7 @@ def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -
 
 
 def _adjacency(surface: Surface) -> csr_matrix:
-    """(V, V) 1 for each pair of vertices with an edge between them."""
+    """Return (V, V) 1 for each pair of vertices with an edge between them."""
     f, n = surface.faces, len(surface.vertices_m)
     begun = np.zeros(n + 1, dtype=np.int64)
     for k in range(3):
@@ -264,7 +264,7 @@ class Fused:
     corrections: tuple[RegionCorrection, ...]
 
     def share(self, source: Source) -> float:
-        """Share of the vertices from this source."""
+        """Return the share of the vertices from this source."""
         return float(np.mean(self.source == source))
 
 
@@ -330,7 +330,7 @@ def _smooth_step(x: Array) -> Array:
 
 
 def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, settings: FusionSettings) -> Array:
-    """(V,) standard deviation along the normal; where both count, their disagreement does, too."""
+    """Return (V,) standard deviation along the normal; where both count, their disagreement does, too."""
     ct = np.full(len(weight), sigma_ct_m**2)
     if settings.alignment_covariance is not None:
         normals = carrier.vertex_normals
@@ -343,7 +343,7 @@ def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, setti
 
 
 def without_specks(ct: Surface, least_m2: float) -> Surface:
-    """The CT without small unconnected parts (noise) and without vertices that no face has."""
+    """Return the CT without small unconnected parts (noise) and without vertices that no face has."""
     if not ct.is_mesh:
         raise ComputeError("fusion needs a mesh of the CT", remedy="Extract its surface first")
     if least_m2 <= 0:
@@ -355,7 +355,7 @@ def without_specks(ct: Surface, least_m2: float) -> Surface:
 
 
 def outside(surface: Surface, region: Region) -> Surface:
-    """The surface without the faces that touch a region."""
+    """Return the surface without the faces that touch a region."""
     inside = region.contains(surface.vertices_m)
     if not inside.any():
         return compact(surface.vertices_m, surface.faces)[0]
@@ -363,7 +363,7 @@ def outside(surface: Surface, region: Region) -> Surface:
 
 
 def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
-    """The mesh without vertices that no face has, and the former index (V,) of each that is left."""
+    """Return the mesh without vertices that no face has, and the former index (V,) of each that is left."""
     used = np.zeros(len(vertices), dtype=np.bool_)
     used[faces.ravel()] = True
     kept = np.flatnonzero(used)
@@ -380,7 +380,7 @@ class _Addition:
     removed: Region | None
 
     def taken(self, carrier: Surface) -> Mask:
-        """(F,) faces of the scan that are far from the CT, or touch what was taken away since."""
+        """Return (F,) faces of the scan that are far from the CT, or touch what was taken away since."""
         far_m = 2 * self.settings.overlap.distance_m
         vertices = self.scan.vertices_m
         far = PointIndex(carrier.vertices_m).nearest(vertices, far_m)[0] > far_m
@@ -434,7 +434,7 @@ class Markers:
     margin_m: float = 0.002
 
     def near(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) are on a sphere or a post, or within the margin of one."""
+        """Return (N,) which points (N, 3) are on a sphere or a post, or within the margin of one."""
         up = self.up / np.linalg.norm(self.up)
         out = np.zeros(len(points_m), dtype=np.bool_)
         for centre in self.centres_m:
@@ -448,7 +448,7 @@ class Markers:
 
 
 def without_markers(fused: Fused, markers: Markers) -> Fused:
-    """The ground truth without the faces that touch a sphere or a post; where they stood it is open."""
+    """Return the ground truth without the faces that touch a sphere or a post; where they stood it is open."""
     near = markers.near(fused.surface.vertices_m)
     surface, kept = compact(fused.surface.vertices_m, fused.surface.faces[~fused.surface.touching(near)])
     return replace(

@@ -160,13 +160,13 @@ def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | N
 
 
 def _size_and_facing(surface: Surface, faces: slice, up: Array) -> Array:
-    """(N, 2) a third of the area of some faces, and of that area as seen from above: each corner's part."""
+    """Return (N, 2) a third of the area of some faces, and of that area as seen from above: each corner's part."""
     vectors = surface.area_vectors_of(faces) / 3
     return np.stack([np.linalg.norm(vectors, axis=1), vectors @ (up / np.linalg.norm(up))], axis=1)
 
 
 def components(surface: Surface, chosen: Mask) -> IntArray:
-    """(V,) number of the connected part that each chosen vertex is in; -1 for the others."""
+    """Return (V,) number of the connected part that each chosen vertex is in; -1 for the others."""
     index = np.full(len(chosen), -1, dtype=np.int32)
     n = int(chosen.sum())
     index[chosen] = np.arange(n)
@@ -203,7 +203,7 @@ def _spanning(faces: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDAr
 
 
 def rim_vertices(surface: Surface) -> IntArray:
-    """(K,) vertices on edges that only one face has."""
+    """Return (K,) vertices on edges that only one face has."""
     f, n = surface.faces, len(surface.vertices_m)
     ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).astype(np.int64), axis=1)
     keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
@@ -220,7 +220,7 @@ def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
 
 
 def _closed(points: Array, chosen: Mask, radius: float) -> Mask:
-    """Grown and shrunk by a radius, so that gaps and islands between chosen points are chosen, too."""
+    """Grow and shrink a mask by a radius, so that gaps and islands between chosen points are chosen, too."""
     grown = distance_to(points, chosen, radius) <= radius
     return chosen | (distance_to(points, ~grown, radius) > radius)
 
@@ -239,7 +239,7 @@ class Region(Protocol):
     """A part of space."""
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie inside."""
+        """Return (N,) which points (N, 3) lie inside."""
         ...
 
 
@@ -251,7 +251,7 @@ class Box:
     size_m: Array
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie inside or on the faces."""
+        """Return (N,) which points (N, 3) lie inside or on the faces."""
         return np.all(np.abs(apply(inverse(self.T_world_box), points_m)) <= 0.5 * self.size_m, axis=1)
 
 
@@ -287,7 +287,7 @@ class SphereRegion:
     radius_m: float
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie in it."""
+        """Return (N,) which points (N, 3) lie in it."""
         out = np.zeros(len(points_m), dtype=np.bool_)
         for centre in self.centres_m:
             beside = np.flatnonzero(np.abs(points_m[:, 0] - centre[0]) <= 1.001 * self.radius_m)  # few are
@@ -311,7 +311,7 @@ class RegionCorrection:
 
 
 def corrected(proposed: Mask, points_m: Array, corrections: Sequence[RegionCorrection]) -> Mask:
-    """(N,) the mask after the corrections, of which a later one overrules an earlier one."""
+    """Return (N,) the mask after the corrections, of which a later one overrules an earlier one."""
     out = proposed.copy()
     for correction in corrections:
         out[correction.region.contains(points_m)] = correction.from_ct
@@ -347,7 +347,7 @@ def outline(points_m: Array, up: Array) -> Prism:
 
 
 def _plane(direction: Array) -> Transform:
-    """(4, 4) rotation whose z is this direction (3,)."""
+    """Return (4, 4) rotation whose z is this direction (3,)."""
     z = direction / np.linalg.norm(direction)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)

@@ -27,7 +27,7 @@ class Surface:
 
     @classmethod
     def kept(cls, path: Path) -> Surface:
-        """The mesh of a CT or a scan as an import keeps it: an .npz file of `vertices_m` and `faces`."""
+        """Return the mesh of a CT or a scan as an import keeps it: an .npz file of `vertices_m` and `faces`."""
         with np.load(path, allow_pickle=False) as mesh:
             return cls(mesh["vertices_m"].astype(np.float64, copy=False), mesh["faces"])  # their integers are short
 
@@ -45,17 +45,17 @@ class Surface:
         return out
 
     def blocks(self) -> Iterator[slice]:
-        """The faces in blocks, in order."""
+        """Yield the faces in blocks, in order."""
         for begin in range(0, len(self.faces), FACES):
             yield slice(begin, min(begin + FACES, len(self.faces)))
 
     def touching(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(F,) which faces have one of the chosen (V,) vertices."""
+        """Return (F,) which faces have one of the chosen (V,) vertices."""
         one, other, third = self.faces.T
         return chosen[one] | chosen[other] | chosen[third]
 
     def area_vectors_of(self, chosen: IntArray | slice) -> Array:
-        """(N, 3) `area_vectors_m2` of some faces alone."""
+        """Return (N, 3) `area_vectors_m2` of some faces alone."""
         corners = self.faces[chosen]
         out = np.empty((len(corners), 3))
         for begin in range(0, len(corners), FACES):
@@ -65,7 +65,7 @@ class Surface:
         return out
 
     def normals_of(self, chosen: IntArray | slice) -> Array:
-        """(N, 3) unit normals of some faces; zero for faces without area."""
+        """Return (N, 3) unit normals of some faces; zero for faces without area."""
         vectors = self.area_vectors_of(chosen)
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
@@ -106,7 +106,7 @@ class Surface:
         return float(self.face_areas_m2.sum())
 
     def moved(self, T_a_b: Transform) -> Surface:
-        """This surface, of frame b, in frame a."""
+        """Return this surface, of frame b, in frame a."""
         normals = None if self.normals is None else self.normals @ T_a_b[:3, :3].T
         return Surface(apply(T_a_b, self.vertices_m), self.faces, normals)
 
@@ -157,7 +157,7 @@ def ply_bytes(
 def _ply_blocks(
     columns: Mapping[str, NDArray[np.generic]], faces: NDArray[np.integer], comments: Sequence[str]
 ) -> Iterator[bytes]:
-    """The file in blocks."""
+    """Yield the file in blocks."""
     kinds = {name: values.dtype.newbyteorder("<").str for name, values in columns.items()}
     vertices = len(columns["x"])
     lines = [
@@ -183,7 +183,7 @@ def _ply_blocks(
 
 
 def read_ply(path: Path) -> tuple[dict[str, NDArray[np.generic]], IntArray]:
-    """The properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
+    """Return the properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
 
     Raises:
         DataError: another program wrote the file, or its end is missing.

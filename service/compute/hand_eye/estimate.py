@@ -296,7 +296,7 @@ def _agreed(
     sized: Callable[[HandEyeSolution, float], BoardSizeFound],
     rng: np.random.Generator,
 ) -> _Agreed:
-    """The views on which robot and images agree; `check` refuses poses that do not belong together."""
+    """Return the views on which robot and images agree; `check` refuses poses that do not belong together."""
 
     def solved(turned: NDArray[np.bool_]) -> _Agreed:
         straight, sigma_px = _straightened(data, turned, T_board_turned)
@@ -320,13 +320,13 @@ def _agreed(
 
 
 def _folds(n: int, seed: int) -> NDArray[np.int64]:
-    """(n,) fold of each view."""
+    """Return (n,) fold of each view."""
     count = min(_FOLDS if n > _FEW else 2 * _FOLDS, n)
     return np.random.default_rng(seed).permutation(n) % count
 
 
 def _outcomes(agreed: _Agreed, method: Method, folds: NDArray[np.int64], point: Array) -> dict[ArmTerms, _Outcome]:
-    """The answer without the arm's errors, and with each model of them that the views allow."""
+    """Return the answer without the arm's errors, and with each model of them that the views allow."""
     data, keep, plain = agreed.data, agreed.keep, agreed.plain
     outcomes: dict[ArmTerms, _Outcome] = {
         "none": _Outcome(plain, *held_out(data, keep, method, "none", (plain, None), folds, point))
@@ -343,7 +343,7 @@ def _outcomes(agreed: _Agreed, method: Method, folds: NDArray[np.int64], point: 
 def _corrected(
     outcomes: dict[ArmTerms, _Outcome], rms_mm: dict[ArmTerms, float], quality: Callable[[_Outcome], dict[str, Any]]
 ) -> CorrectedHandEye | None:
-    """The answer with the arm's errors that held-out views support best; None if they do not improve."""
+    """Return the answer with the arm's errors that held-out views support best; None if they do not improve."""
     best = min(rms_mm, key=lambda terms: rms_mm[terms])
     correction = outcomes[best].answer.correction
     if correction is None or rms_mm[best] >= _WORTH * rms_mm["none"]:
@@ -352,7 +352,7 @@ def _corrected(
 
 
 def _bootstrap(good: HandEyeMeasurements, method: Method, count: int, seed: int, outcome: _Outcome) -> Array:
-    """(6, 6) covariance of T_flange_camera by resampling the views."""
+    """Return (6, 6) covariance of T_flange_camera by resampling the views."""
     covariance = bootstrap_covariance(good, method, outcome.answer, count, np.random.default_rng(seed))
     if method in CLOSED_FORMS:
         return not_below_held_out(covariance, outcome.held_out_mm, outcome.held_out_deg)
@@ -365,12 +365,12 @@ def _with_size(
     quality: Callable[[BoardSizeFound, _Outcome], dict[str, Any]],
     outcome: _Outcome,
 ) -> dict[str, Any]:
-    """`quality` of an answer with the arm's errors, which shows the board's size better than one without them."""
+    """Return `quality` of an answer with the arm's errors, which shows the board's size better than one without them."""
     return quality(sized(without_size(good, outcome.answer), outcome.answer.scale), outcome)
 
 
 def _sized(board: Board | None, count: int, seed: int, free: HandEyeSolution, used: float) -> BoardSizeFound:
-    """The board's size by the robot (`size_found`). Raises ComputeError if it is not credible."""
+    """Return the board's size by the robot (`size_found`). Raises ComputeError if it is not credible."""
     assert free.views is not None
     n = len(free.views.T_base_flange)
     counts = bootstrap_counts(bootstrap_picks(n, count, np.random.default_rng(seed)), n)
@@ -387,7 +387,7 @@ def _quality(
     size: BoardSizeFound,
     outcome: _Outcome,
 ) -> dict[str, Any]:
-    """The fields of a HandEyeAnswer."""
+    """Return the fields of a HandEyeAnswer."""
     answer = outcome.answer
     residual = deviation(data.placed(answer), answer.T_base_board, point_m)
     covariance = resampled(outcome) + share
@@ -410,7 +410,7 @@ def _quality(
 
 
 def _measured(views: HandEyeViews) -> HandEyeMeasurements:
-    """The views as arrays whose shapes agree."""
+    """Return the views as arrays whose shapes agree."""
     corners = views.corners
     hands = np.asarray(views.T_base_flange, dtype=np.float64)
     boards = np.asarray(views.T_camera_board, dtype=np.float64)
@@ -432,7 +432,7 @@ def _measured(views: HandEyeViews) -> HandEyeMeasurements:
 def _straightened(
     data: HandEyeMeasurements, turned: NDArray[np.bool_], T_board_turned: Transform | None
 ) -> tuple[HandEyeMeasurements, float | None]:
-    """The views with half-turned boards turned back, their corners renumbered, and the boards' covariance."""
+    """Return the views with half-turned boards turned back, their corners renumbered, and the boards' covariance."""
     boards, corners = data.boards, data.corners
     if T_board_turned is not None:
         boards = np.where(turned[:, None, None], boards @ T_board_turned, boards)
@@ -447,7 +447,7 @@ def _straightened(
 def _arm_answer(
     data: HandEyeMeasurements, keep: NDArray[np.bool_], plain: HandEyeSolution, terms: ArmTerms, noise: Noise
 ) -> tuple[HandEyeSolution, NDArray[np.bool_], Noise]:
-    """The fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
+    """Return the fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
     good = data.take(keep)
     answer = fit_with_arm(good, plain, terms, noise)
     wrong = arm_outliers(answer)
@@ -461,7 +461,7 @@ def _arm_answer(
 
 
 def _methods(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> dict[Method, Transform]:
-    """T_flange_camera by every method that has an answer."""
+    """Return T_flange_camera by every method that has an answer."""
     answers: dict[Method, Transform] = {method: answer.T_flange_camera}
     resized = data.resized(answer.scale)
     for name, T in all_closed_forms(resized.hands, resized.boards).items():

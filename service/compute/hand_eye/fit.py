@@ -117,19 +117,19 @@ class HandEyeMeasurements:
         )
 
     def resized(self, scale: float) -> HandEyeMeasurements:
-        """The measurements for a board that is `scale` times as large."""
+        """Return the measurements for a board that is `scale` times as large."""
         corners = self.corners
         if corners is not None:
             corners = BoardCorners(scale * corners.points_m, corners.corners_px, corners.camera)
         return dataclasses.replace(self, boards=scaled(self.boards, scale), corners=corners)
 
     def views(self) -> BoardViews:
-        """The views for a weighted fit without parameters of the arm."""
+        """Return the views for a weighted fit without parameters of the arm."""
         kind, design = np.zeros(0, dtype=np.int64), np.zeros((len(self.hands), 6, 0))
         return BoardViews(self.hands, self.boards, self.covariance, design, kind, np.zeros(0), self.size_sigma)
 
     def arm_views(self, terms: ArmTerms, about: Array | None = None) -> BoardViews:
-        """The views for a weighted fit with these parameters (K,) of the arm, near `about`; None: near zero.
+        """Return the views for a weighted fit with these parameters (K,) of the arm, near `about`; None: near zero.
 
         Raises:
             DataError: the joints are another arm's.
@@ -146,7 +146,7 @@ class HandEyeMeasurements:
         return BoardViews(hands, self.boards, self.covariance, design, kind, about, self.size_sigma, known)
 
     def placed(self, answer: HandEyeSolution) -> Array:
-        """(N, 4, 4) T_base_board from each view alone."""
+        """Return (N, 4, 4) T_base_board from each view alone."""
         hands = self.hands
         if answer.correction is not None:
             assert self.joints_rad is not None
@@ -155,7 +155,7 @@ class HandEyeMeasurements:
 
 
 def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[int, str]:
-    """Views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
+    """Return the views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
 
     Raises:
         ComputeError: more than a third of the views disagree.
@@ -194,7 +194,7 @@ def _answer_of(fit: Fit) -> HandEyeSolution:
 
 
 def _noise_at(data: HandEyeMeasurements, fit: Fit) -> Noise:
-    """A robust initial estimate of the noise from the increments near an answer."""
+    """Return a robust initial estimate of the noise from the increments near an answer."""
     e, _, _ = linearise(data.hands, scaled(data.boards, fit.scale), fit.T_flange_camera, fit.T_base_board)
     lengths = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
     robot_m, robot_rad = (max(float(v) / _MEDIAN_NORM, FLOOR_M) for v in np.median(lengths, axis=0))
@@ -202,7 +202,7 @@ def _noise_at(data: HandEyeMeasurements, fit: Fit) -> Noise:
 
 
 def turned_back(data: HandEyeMeasurements, answer: HandEyeSolution, T_board_turned: Transform) -> NDArray[np.bool_]:
-    """(N,) views that fit the answer better with the board turned by half a turn."""
+    """Return (N,) views that fit the answer better with the board turned by half a turn."""
     apart = [
         dataclasses.replace(data, boards=boards, corners=None).placed(answer)
         for boards in (data.boards, data.boards @ T_board_turned)
@@ -275,7 +275,7 @@ def _fit_weighted(data: HandEyeMeasurements, start: HandEyeSolution | None) -> H
 
 
 def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms) -> Noise:
-    """Noise of the model with these arm parameters, before any selection among them.
+    """Return the noise of the model with these arm parameters, before any selection among them.
 
     Raises:
         DataError: the joints are another arm's.
@@ -293,7 +293,7 @@ def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms
 def _settled(
     data: HandEyeMeasurements, terms: ArmTerms, kind: NDArray[np.int64], noise: Noise, near: Fit
 ) -> tuple[BoardViews, Fit]:
-    """The fit with the arm's parameters, and the views with the derivative taken there."""
+    """Return the fit with the arm's parameters, and the views with the derivative taken there."""
     views = dataclasses.replace(data.arm_views(terms), kind=kind)
     fit = solve(views, noise, near)
     for _ in range(_DERIVATIVES):
@@ -339,14 +339,14 @@ def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
 
 
 def _groups(arm: ArmModel) -> NDArray[np.int64]:
-    """(P,) group of each parameter: its kind for the geometry, then one for each harmonic of each joint."""
+    """Return (P,) group of each parameter: its kind for the geometry, then one for each harmonic of each joint."""
     joints, waves = np.arange(arm.axes)[:, None, None], np.arange(arm.tolerances.harmonics)
     gears = np.broadcast_to(GEOMETRY_KINDS + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
     return np.concatenate([_kinds(arm, "geometry"), gears.ravel()])
 
 
 def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
-    """(J,) share of the prior variance that the data removed, joint by joint."""
+    """Return (J,) share of the prior variance that the data removed, joint by joint."""
     prior = np.array(noise.scales)[kind] ** 2
     left = np.diag(fit.covariance)[-len(kind) :]
     joints = np.arange(arm.axes)
@@ -355,7 +355,7 @@ def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) ->
 
 
 def arm_outliers(answer: HandEyeSolution) -> NDArray[np.bool_]:
-    """(N,) views that a fit with the arm's errors does not explain, though a fit without them may."""
+    """Return (N,) views that a fit with the arm's errors does not explain, though a fit without them may."""
     assert answer.views is not None
     assert answer.noise is not None
     assert answer.fit is not None

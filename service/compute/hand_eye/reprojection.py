@@ -43,7 +43,7 @@ class BoardCorners:
 
 
 def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel) -> BoardCorners:
-    """The corners of a board's views, which may be partial, as one array."""
+    """Return the corners of a board's views, which may be partial, as one array."""
     points = board.points()
     pixels = np.full((len(views), len(points), 2), np.nan)
     for row, view in zip(pixels, views, strict=True):
@@ -88,7 +88,7 @@ def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Arra
 
 
 def _grams(hands: Array, corners: BoardCorners, X: Transform, B: Transform) -> Array:
-    """(N, 13, 13) Gram matrices of each view's rows [J | residual]."""
+    """Return (N, 13, 13) Gram matrices of each view's rows [J | residual]."""
     boards = np.array([inverse(hand @ X) @ B for hand in hands])
     pixels, J = projection_jacobian(corners.points_m, boards, corners.camera)
     _, to_flange, from_board = linearise(hands, boards, X, B)
@@ -161,6 +161,6 @@ def _settles(here: _Iterate, there: _Iterate) -> bool:
 
 
 def resample_reprojection(hands: Array, corners: BoardCorners, X: Transform, B: Transform, counts: Array) -> Array:
-    """(R, 12) increments of the answer if view i counts `counts[r, i]` times."""
+    """Return (R, 12) increments of the answer if view i counts `counts[r, i]` times."""
     flat = counts @ _grams(hands, corners, X, B).reshape(len(hands), -1)
     return np.array([_step(row.reshape(13, 13)) for row in flat])

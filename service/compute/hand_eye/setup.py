@@ -35,7 +35,7 @@ _USUAL_NOISE_M = 1e-3  # of an arm, to weigh the stated size of the board agains
 
 
 def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transform:
-    """T_flange_camera from poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
+    """Return T_flange_camera from poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
 
     Source: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989, Horaud and Dornaika 1995, Andreff et al. 1999,
     as OpenCV implements them.
@@ -60,7 +60,7 @@ def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transf
 
 
 def all_closed_forms(hands: Array, boards: Array) -> dict[ClosedForm, Transform]:
-    """T_flange_camera by every method that gives an answer."""
+    """Return T_flange_camera by every method that gives an answer."""
     answers: dict[ClosedForm, Transform] = {}
     for method in CLOSED_FORMS:
         try:
@@ -132,7 +132,7 @@ class RobustStart:
     scale: float
 
     def placed(self, hands: Array, boards: Array) -> Array:
-        """(N, 4, 4) T_base_board from each view alone."""
+        """Return (N, 4, 4) T_base_board from each view alone."""
         return hands @ self.T_flange_camera @ scaled(boards, self.scale)
 
 
@@ -167,7 +167,7 @@ def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
 
 
 def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> RobustStart:
-    """The answer of the subset of views that fits half of all views best.
+    """Return the answer of the subset of views that fits half of all views best.
 
     Least median of squares over random subsets (Rousseeuw 1984) and all views, so that a few wrong poses have no
     influence.
@@ -202,7 +202,7 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> Robus
 
 
 def mean_pose(poses: Array) -> Transform:
-    """Mean position and mean rotation of poses (N, 4, 4)."""
+    """Return the mean position and mean rotation of poses (N, 4, 4)."""
     return transform(Rotation.from_matrix(poses[:, :3, :3]).mean(), poses[:, :3, 3].mean(axis=0))
 
 
@@ -216,7 +216,7 @@ def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tu
 
 
 def distance(a: Transform, b: Transform) -> tuple[float, float]:
-    """Distance in mm and angle in degrees between two poses."""
+    """Return the distance in mm and angle in degrees between two poses."""
     offset = inverse(a) @ b
     return mm(float(np.linalg.norm(offset[:3, 3]))), deg(rotation_angle_rad(offset))
 
@@ -276,7 +276,7 @@ class PosesAsRead:
     readings: tuple[PoseReading, ...] = ()
 
     def inverted(self) -> PosesAsRead:
-        """The same with every pose inverted."""
+        """Return the same with every pose inverted."""
         readings = tuple(replace(reading, hands=inverted(reading.hands)) for reading in self.readings)
         return replace(self, hands=inverted(self.hands), readings=readings)
 
@@ -314,7 +314,7 @@ class SetupFit:
 
 
 def inverted(poses: Array) -> Array:
-    """(N, 4, 4) inverses of poses (N, 4, 4)."""
+    """Return (N, 4, 4) inverses of poses (N, 4, 4)."""
     return np.array([inverse(T) for T in poses])
 
 
@@ -381,7 +381,7 @@ def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: b
 
 
 def _lost_row(hands: Array, boards: Array, point_m: Array, poses: PosesAsRead | None) -> str | None:
-    """How the poses fit if a row was lost, or there twice: from one view on, each has its neighbour's pose."""
+    """Return how the poses fit if a row was lost, or there twice: from one view on, each has its neighbour's pose."""
     if len(hands) < MIN_VIEWS + _LOST_FEWEST:
         return None
     every, rows = (hands, np.arange(len(hands))) if poses is None else (poses.hands, poses.rows)
@@ -401,7 +401,7 @@ def _lost_row(hands: Array, boards: Array, point_m: Array, poses: PosesAsRead | 
 
 
 def _answers_of_a_half(hands: Array, moved: Array, boards: Array) -> Iterator[RobustStart]:
-    """Answers of the first views with their own poses, and of the last ones with their neighbours'.
+    """Yield answers of the first views with their own poses, and of the last ones with their neighbours'.
 
     The row is lost in one half, so one of the two halves has no wrong pose.
     """
@@ -430,7 +430,7 @@ def _ordinal(number: int) -> str:
 
 
 def _near(common: RobustStart, hands: Array, boards: Array, point_m: Array) -> NDArray[np.bool_]:
-    """(N,) whether each view places the board where the common answer does."""
+    """Return (N,) whether each view places the board where the common answer does."""
     mm, deg = deviation(common.placed(hands, boards), common.T_base_board, point_m)
     return (mm <= _MOST_MM / 2) & (deg <= _MOST_DEG / 2)
 

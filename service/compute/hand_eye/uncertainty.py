@@ -26,7 +26,7 @@ _MIN_DISTINCT = 4  # distinct views in a bootstrap replicate
 def bootstrap_covariance(
     data: HandEyeMeasurements, method: Method, answer: HandEyeSolution, count: int, rng: np.random.Generator
 ) -> Array:
-    """(6, 6) covariance of T_flange_camera from resampling whole images.
+    """Return (6, 6) covariance of T_flange_camera from resampling whole images.
 
     It also covers systematic errors, as far as they differ from pose to pose.
     """
@@ -56,7 +56,7 @@ def bootstrap_picks(n: int, count: int, rng: np.random.Generator) -> list[NDArra
 
 
 def bootstrap_counts(picks: Sequence[NDArray[np.int64]], n: int) -> Array:
-    """(R, n) how often each view counts in each draw."""
+    """Return (R, n) how often each view counts in each draw."""
     return np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
 
 
@@ -68,13 +68,13 @@ def _resized_share(data: HandEyeMeasurements, method: Method, answer: HandEyeSol
 
 
 def _increment(after: Transform, before: Transform) -> Array:
-    """(6,) shift in metres and turn in radians, in the outer axes."""
+    """Return (6,) shift in metres and turn in radians, in the outer axes."""
     turn = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
     return np.concatenate([after[:3, 3] - before[:3, 3], turn])
 
 
 def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
-    """(6, 6) covariance of T_flange_camera due to the camera calibration's uncertainty, common to all images.
+    """Return (6, 6) covariance of T_flange_camera due to the camera calibration's uncertainty, common to all images.
 
     Board poses and then the mount are found again with cameras displaced by one standard deviation; by Park's closed
     form, which reacts to the camera's error as the other methods do.
@@ -93,7 +93,7 @@ def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
 
 
 def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraModel) -> Transform:
-    """T_camera_board of one view refined with another camera, starting from T."""
+    """Return T_camera_board of one view refined with another camera, starting from T."""
     seen = np.flatnonzero(np.isfinite(corners.corners_px[index]).all(axis=1))
     view = BoardView(seen, corners.corners_px[index][seen])
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
@@ -101,7 +101,7 @@ def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraMode
 
 
 def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Array) -> Array:
-    """The covariance (6, 6) with translation and rotation each scaled up to what held-out images require.
+    """Return the covariance (6, 6) with translation and rotation each scaled up to what held-out images require.
 
     A closed form has no noise model, and views with similar errors give similar resamples. But the mean of N views is
     not known better than their held-out scatter over the root of N.
@@ -198,7 +198,7 @@ def _likely(ratio: float) -> str:
 
 
 def size_sigma(tolerance: float) -> float:
-    """Standard deviation of a size whose error is anything within a tolerance."""
+    """Return the standard deviation of a size whose error is anything within a tolerance."""
     return tolerance / float(np.sqrt(3))
 
 

@@ -157,14 +157,14 @@ def _rows(views: BoardViews, fit: Fit) -> tuple[Array, Array]:
 
 
 def _grams(views: BoardViews, noise: Noise, fit: Fit) -> Array:
-    """(N, P + 1, P + 1) Gram matrices of each view's whitened rows."""
+    """Return (N, P + 1, P + 1) Gram matrices of each view's whitened rows."""
     rows, images = _rows(views, fit)
     white = np.linalg.solve(np.linalg.cholesky(_robot(noise) + images), rows)
     return np.swapaxes(white, 1, 2) @ white
 
 
 def _with_prior(gram: Array, views: BoardViews, scale: float) -> Array:
-    """A summed Gram matrix with the board's stated size as one more row."""
+    """Return a summed Gram matrix with the board's stated size as one more row."""
     row = np.zeros(len(gram))
     row[_SCALE], row[-1] = 1.0, scale - 1
     return gram + views.size_precision * np.outer(row, row)
@@ -197,7 +197,7 @@ def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
 
 
 def _factor(scaled: Array) -> Array:
-    """Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError if it is singular."""
+    """Return the Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError if it is singular."""
     try:
         L = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
     except np.linalg.LinAlgError as error:
@@ -208,7 +208,7 @@ def _factor(scaled: Array) -> Array:
 
 
 def start_at(X: Transform, B: Transform, scale: float, count: int = 0) -> Fit:
-    """T_flange_camera, T_base_board and the board's scale as a start, with `count` parameters of the arm."""
+    """Return T_flange_camera, T_base_board and the board's scale as a start, with `count` parameters of the arm."""
     return Fit(X, B, scale, np.zeros(count), np.zeros((_COMMON + count,) * 2))
 
 
@@ -263,7 +263,7 @@ def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float
     members = np.array([views.kind == g for g in range(len(start.scales))], dtype=np.float64)
 
     def objective(logs: Array) -> tuple[float, Array]:
-        """Half the deviance and its gradient."""
+        """Return half the deviance and its gradient."""
         noise = _noise(logs)
         prior = _prior(noise, views.kind)
         L = np.linalg.cholesky(_robot(noise) + images)
@@ -348,7 +348,7 @@ def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
 
 
 def prior_share(views: BoardViews, noise: Noise, fit: Fit) -> Array:
-    """(13 + K, 13 + K) part of the answer's covariance that is due to what was known before the images.
+    """Return (13 + K, 13 + K) part of the answer's covariance that is due to what was known before the images.
 
     The images pull the board's size and the arm's parameters away from their stated values only as far as they
     determine them. The rest of their errors stays, however often the images are resampled.

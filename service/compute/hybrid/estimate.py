@@ -61,7 +61,7 @@ def camera_share(solution: BundleSolution, data: AdjustmentData, known: CameraCo
 
 
 def _read_by(sightings: SphereSightings | None, held: CameraModel, other: CameraModel) -> SphereSightings | None:
-    """The outlines' cones recomputed from the same pixels with another camera model."""
+    """Return the outlines' cones recomputed from the same pixels with another camera model."""
     if sightings is None:
         return None
     azimuth = np.linspace(0.0, 2 * np.pi, _RIM, endpoint=False)
@@ -164,7 +164,7 @@ class HybridPoses:
         return np.array([joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(self.T_world_camera))])
 
     def joint_world_covariance(self) -> Array:
-        """(6 N + 6, 6 N + 6) of every image's T_world_camera and, last, of T_world_scan."""
+        """Return (6 N + 6, 6 N + 6) of every image's T_world_camera and, last, of T_world_scan."""
         n = len(self.T_scan_camera)
         J = np.zeros((6 * n + 6, len(self.covariance)))
         R = self.T_world_scan[:3, :3]
@@ -186,7 +186,7 @@ class HybridPoses:
         return self.joint_world_covariance()[-6:, -6:]
 
     def sigma_at_m(self, point_scan_m: Array) -> float:
-        """Predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
+        """Return the predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
 
         For the set of images as a whole, aligned to the true one by its camera positions: errors of single images
         average out, common errors remain.
@@ -268,7 +268,7 @@ def hybrid_poses(
 def _data(
     tracks: Tracks, sightings: SphereSightings, spheres: ScanSpheres, camera: CameraModel, settings: HybridOptions
 ) -> AdjustmentData:
-    """The measurements of tracks and spheres, with their priors."""
+    """Return the measurements of tracks and spheres, with their priors."""
     common = settings.common_errors or EXPECTED_COMMON_ERRORS
     covariance = spheres.covariance_m2
     if covariance is None:
@@ -313,7 +313,7 @@ def _answer(
 
 
 def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationResult) -> SphereSightings:
-    """The outlines that the registration used; a marker that it never used keeps its position in the scan."""
+    """Return the outlines that the registration used; a marker that it never used keeps its position in the scan."""
     used = [r for r in start.residuals if not r.excluded]
     found = [outlines[r.image][r.outline] for r in used]
     whitening = whitening_of(np.array([o.cone_covariance for o in found]))
@@ -328,7 +328,7 @@ def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationR
 def _bases(
     T_scan_camera: Array, T_base_camera: Array | None, stations: NDArray[np.int64]
 ) -> tuple[Array, list[int], NDArray[np.int64]]:
-    """Initial T_scan_base (G, 4, 4), the groups in order, and each image's index among them."""
+    """Return the initial T_scan_base (G, 4, 4), the groups in order, and each image's index among them."""
     if T_base_camera is None:
         return np.empty((0, 4, 4)), [], np.zeros(len(stations), dtype=np.int64)
     known = np.isfinite(T_base_camera).all(axis=(1, 2))

@@ -48,7 +48,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def _checked(path: Path) -> bytes:
-    """The content of an image file, which decides its kind, not its name."""
+    """Return the content of an image file, which decides its kind, not its name."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -71,7 +71,7 @@ def _unreadable(path: Path, error: OSError) -> DataError:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
+    """Return (H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
 
     Raises:
         DataError: the file is missing, truncated or not a decodable image.
@@ -161,7 +161,7 @@ class ImageFolder:
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
     def without(self, reasons: dict[str, str]) -> ImageFolder:
-        """The folder without these images, whose reasons are added."""
+        """Return the folder without these images, whose reasons are added."""
         kept = tuple(file for file in self.files if file.name not in reasons)
         return ImageFolder(kept, self.left_out | reasons)
 
@@ -212,7 +212,7 @@ def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: b
 
 
 def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
-    """The error for odd files with `--strict`."""
+    """Return the error for odd files with `--strict`."""
     return DataError(
         f"{counted(len(reasons), 'odd file')}: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
         where=str(folder),
@@ -221,7 +221,7 @@ def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
 
 
 def _sizes(files: Sequence[Path], folder: Path) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
-    """The sizes of the images, and the reasons why others, though whole, are not read."""
+    """Return the sizes of the images, and the reasons why others, though whole, are not read."""
     sizes: dict[str, tuple[int, int]] = {}
     foreign: dict[str, str] = {}
     damaged: list[str] = []
@@ -245,7 +245,7 @@ def _sizes(files: Sequence[Path], folder: Path) -> tuple[dict[str, tuple[int, in
 
 
 def _copies(files: Sequence[Path]) -> dict[str, str]:
-    """Images that are byte-for-byte copies of an earlier one, with reasons."""
+    """Return the images that are byte-for-byte copies of an earlier one, with reasons."""
     alike: defaultdict[int, list[Path]] = defaultdict(list)
     for file in files:
         alike[file.stat().st_size].append(file)
@@ -354,7 +354,7 @@ class ImageQuality:
 
 
 def image_quality(grey: NDArray[np.uint8]) -> ImageQuality:
-    """Quality of an image (H, W); takes some milliseconds per megapixel examined, at most three."""
+    """Return the quality of an image (H, W); takes some milliseconds per megapixel examined, at most three."""
     dark = float(np.percentile(grey[::4, ::4], 99)) < _DARK
     return ImageQuality(float("nan") if dark else _edge_px(grey), dark)
 
@@ -383,7 +383,7 @@ def _middle(part: NDArray[np.int64]) -> slice:
 
 
 def _edges(tile: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Height and steepest slope of every edge in a tile."""
+    """Return the height and steepest slope of every edge in a tile."""
     smooth = np.asarray(cv2.GaussianBlur(tile, (0, 0), _SIGMA_PX), dtype=np.float32)
     across = (smooth[1:-1, 2:] - smooth[1:-1, :-2]) / 2
     along = (smooth[2:, 1:-1] - smooth[:-2, 1:-1]) / 2

@@ -48,14 +48,14 @@ class BoardSurface:
     sigma_m: float
 
     def bent(self, bow_m: Array) -> Array:
-        """(K, 3) points of the board with these terms (S,)."""
+        """Return (K, 3) points of the board with these terms (S,)."""
         out = self.points.copy()
         out[:, 2] += self.bends @ bow_m
         return out
 
 
 def flat_surface(points: Array) -> BoardSurface:
-    """The surface of a board that is exactly as `points` (K, 3)."""
+    """Return the surface of a board that is exactly as `points` (K, 3)."""
     return BoardSurface(points, np.zeros((len(points), 0)), 1.0)
 
 
@@ -114,27 +114,27 @@ class Adjustment:
     sigma_px: float  # robust standard deviation of one coordinate
 
     def T_camera_board(self) -> Array:
-        """(N, 4, 4) poses of the board in the views."""
+        """Return (N, 4, 4) poses of the board in the views."""
         return np.stack([pose_matrix(pose) for pose in self.poses])
 
 
 def rms(residual: Array) -> float:
-    """Two-dimensional root mean square of residuals (2M,)."""
+    """Return the two-dimensional root mean square of residuals (2M,)."""
     return float(np.sqrt(np.sum(residual**2) / (len(residual) / 2)))
 
 
 def pose_matrix(pose: Array) -> Transform:
-    """The transform of OpenCV's rvec and tvec (6,)."""
+    """Return the transform of OpenCV's rvec and tvec (6,)."""
     return transform(Rotation.from_rotvec(pose[:3]), pose[3:])
 
 
 def camera_of(parameters: Array, size: tuple[int, int]) -> CameraModel:
-    """The camera of the first P of PARAMETERS; the others are zero."""
+    """Return the camera of the first P of PARAMETERS; the others are zero."""
     return CameraModel(*size, *(float(v) for v in parameters))
 
 
 def parameters_of(camera: CameraModel, count: int) -> Array:
-    """The first `count` PARAMETERS of a camera, the inverse of `camera_of`."""
+    """Return the first `count` PARAMETERS of a camera, the inverse of `camera_of`."""
     return np.array([getattr(camera, name) for name in PARAMETERS[:count]])
 
 
@@ -148,7 +148,7 @@ def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tu
 
 
 def prior_precision(count: int) -> Array:
-    """(count,) diagonal that the weak prior on k3 … k6 adds to the normal matrix; zero for the other terms."""
+    """Return (count,) diagonal that the weak prior on k3 … k6 adds to the normal matrix; zero for the other terms."""
     precision = np.zeros(count)
     precision[8:] = _PRIOR**2
     return precision
@@ -186,7 +186,7 @@ def start(
 
 
 def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
-    """(6,) rvec and tvec of one view by a known camera.
+    """Return (6,) rvec and tvec of one view by a known camera.
 
     Raises:
         ComputeError: no pose explains the corners.
@@ -204,7 +204,7 @@ def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
 
 
 def fit_pose(view: BoardView, points: Array, camera: CameraModel, pose: Array) -> tuple[Array, float]:
-    """The pose (6,) of one view refined from `pose` with a known camera, and its RMS error in px."""
+    """Return the pose (6,) of one view refined from `pose` with a known camera, and its RMS error in px."""
 
     def at(pose: Array) -> _ViewPose:
         pixels, J, _ = project_with_jacobian(points[view.indices], pose, camera)
@@ -335,7 +335,7 @@ def _settles(here: _Linearised, there: _Linearised) -> bool:
 
 
 def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:
-    """The equations for boards T_camera_board (N, 4, 4) whose points (K, 3) are seen exactly as expected.
+    """Return the equations for boards T_camera_board (N, 4, 4) whose points (K, 3) are seen exactly as expected.
 
     Residuals are zero and corners have a standard deviation of 1 px: this predicts what images will determine.
     """

@@ -171,7 +171,7 @@ def calibrate_intrinsics(
 
 
 def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Transform, float]:
-    """T_camera_board of one view by a calibrated camera, and its RMS reprojection error in px.
+    """Return T_camera_board of one view by a calibrated camera, and its RMS reprojection error in px.
 
     Raises:
         ComputeError: no pose explains the corners.
@@ -182,7 +182,7 @@ def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Tra
 
 
 def surface_of(board: Board) -> BoardSurface:
-    """The board's surface as the stated flatness allows it to be bent."""
+    """Return the board's surface as the stated flatness allows it to be bent."""
     flat = replace(board, bow_m=(0.0, 0.0))
     if board.flatness_m == 0:
         return flat_surface(board.points())
@@ -190,7 +190,7 @@ def surface_of(board: Board) -> BoardSurface:
 
 
 def bent(board: Board, bow_m: Array) -> Board:
-    """The board with an estimated bow (2,), or as it is for none (0,)."""
+    """Return the board with an estimated bow (2,), or as it is for none (0,)."""
     return replace(board, bow_m=(float(bow_m[0]), float(bow_m[1]))) if len(bow_m) else board
 
 
@@ -211,7 +211,7 @@ def leave_one_out(solution: Adjustment) -> Array:
 
 
 def _usable(views: Sequence[BoardView], n_points: int) -> tuple[list[int], dict[int, str]]:
-    """The views with enough corners, and the reasons why the others are not used."""
+    """Return the views with enough corners, and the reasons why the others are not used."""
     used: list[int] = []
     reasons: dict[int, str] = {}
     for index, view in enumerate(views):
@@ -231,7 +231,7 @@ def _solve_without_outliers(
     used: list[int],
     reasons: dict[int, str],
 ) -> tuple[Adjustment, list[int]]:
-    """The solution and the views used; the reasons for the others are added to `reasons`."""
+    """Return the solution and the views used; the reasons for the others are added to `reasons`."""
     count, points = PARAMETER_COUNT[model], surface.points
     suspects: list[int] = []
     begin: tuple[CameraModel, Array] | None = None
@@ -346,7 +346,7 @@ def _largest_angle_deg(directions: Array) -> float:
 
 
 def coverage_map_of(corners: Sequence[Array], size: tuple[int, int]) -> NDArray[np.int64]:
-    """(rows, columns) corners in each cell of the image."""
+    """Return (rows, columns) corners in each cell of the image."""
     edges = [np.linspace(-0.5, size[k] - 0.5, COVERAGE_GRID[k] + 1) for k in (1, 0)]
     everything = np.concatenate(corners)
     inside = np.clip(everything, -0.5, np.array(size) - 0.5)

@@ -64,7 +64,7 @@ class OpticsComparison:
 
 
 def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
-    """One line for each kind of difference, with the images that share it."""
+    """Return one line for each kind of difference, with the images that share it."""
     alike: dict[tuple[str, str, str], list[str]] = {}
     for departure in departures:
         alike.setdefault((departure.field, departure.found, departure.calibrated), []).append(departure.image)

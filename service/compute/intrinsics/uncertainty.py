@@ -71,7 +71,7 @@ class EstimatedCamera:
 
 
 def board_distance_m(result: IntrinsicsResult) -> float:
-    """Median distance of the board's middle along the optical axis, m."""
+    """Return the median distance of the board's middle along the optical axis, m."""
     middle = np.append(result.board.points().mean(axis=0), 1.0)
     return float(np.median((result.T_camera_board @ middle)[:, 2]))
 
@@ -118,7 +118,7 @@ def projection_uncertainty(
 def uncertainty_of(
     result: EstimatedCamera, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
-    """`projection_uncertainty` for a camera determined by any images, including planned ones."""
+    """Compute `projection_uncertainty` for a camera determined by any images, including planned ones."""
     if not 0 < distance_m < np.inf:
         raise DataError(f"a distance of {distance_m} m is not in front of the camera")
     K, noise = _implied_motion(result)
@@ -159,7 +159,7 @@ def uncertainty_of(
 
 
 def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
-    """K (6, Q), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
+    """Return K (6, Q), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
 
     A point p in the camera frame before a change of parameters and poses is at p + d + w x p after it.
     """
@@ -184,7 +184,7 @@ def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
 
 
 def _point_by_pose(points: Array, pose: Array) -> Array:
-    """(3M, 6) derivative of R(rvec) p + t by rvec and tvec."""
+    """Return (3M, 6) derivative of R(rvec) p + t by rvec and tvec."""
     _, dR = cv2.Rodrigues(pose[:3])
     turns = np.asarray(dR, dtype=np.float64).reshape(3, 3, 3)  # by rvec k, then rows and columns of R
     by_rvec = np.einsum("kij,mj->mik", turns, points)
@@ -225,7 +225,7 @@ class CrossValidation:
 
 
 def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidation:
-    """Five-fold and leave-one-out over the views of a calibration.
+    """Return the validate a calibration over its views, five-fold and leave-one-out.
 
     Raises:
         ComputeError: fewer than four views.
@@ -286,7 +286,7 @@ def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) 
 
 
 def _wide_lens(result: IntrinsicsResult) -> list[str]:
-    """The warning that a lens is too wide for its model, if the rational one fits the same views far better."""
+    """Return warning that a lens is too wide for its model, if the rational one fits the same views far better."""
     size = (result.camera.width, result.camera.height)
     try:
         wide = calibrate_intrinsics(result.corners, result.board, size, model="rational")
@@ -301,7 +301,7 @@ def _wide_lens(result: IntrinsicsResult) -> list[str]:
 
 
 def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> list[str]:
-    """Warnings that the images do not determine terms of the distortion."""
+    """Return warnings that the images do not determine terms of the distortion."""
     if result.model == "rational":
         # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
         if uncertainty.worst_px <= _RMS_PX:
@@ -320,7 +320,7 @@ def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) 
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
-    """Reasons to trust this calibration less, in words; empty if there are none."""
+    """Return reasons to trust this calibration less, in words; empty if there are none."""
     found: list[str] = []
     n = len(result.views)
     if n < _VIEWS:

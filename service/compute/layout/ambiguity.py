@@ -153,7 +153,7 @@ def check_layout(
 
 
 def _checked(centres_m: Array, radius_m: float) -> Array:
-    """The centres as numbers (N, 3). Raises DataError or ComputeError, as `check_layout` says."""
+    """Return the centres as numbers (N, 3). Raises DataError or ComputeError, as `check_layout` says."""
     centres = np.asarray(centres_m, dtype=np.float64)
     if centres.ndim != 2 or centres.shape[1] != 3 or not np.isfinite(centres).all():
         raise DataError(f"sphere centres of shape {centres.shape} are not points (N, 3)")
@@ -201,7 +201,7 @@ def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]
 
 
 def layout_bounds(report: LayoutReport) -> dict[str, tuple[BoundedLength, float]]:
-    """The numbers of a layout that gates judge, by measure name, each with its required value (m)."""
+    """Return the numbers of a layout that gates judge, by measure name, each with its required value (m)."""
     found = {
         "layout_margin_mm": (report.margin, REQUIRED_MARGIN_M),
         "layout_margin_of_five_mm": (report.margin_of_five, REQUIRED_MARGIN_OF_FIVE_M),
@@ -211,7 +211,7 @@ def layout_bounds(report: LayoutReport) -> dict[str, tuple[BoundedLength, float]
 
 
 def layout_measures(report: LayoutReport) -> dict[str, float]:
-    """The numbers of a layout by measure name, lengths in mm; the same in every step."""
+    """Return the numbers of a layout by measure name, lengths in mm; the same in every step."""
     return {
         **{name: mm(bounded.value_m) for name, (bounded, _) in layout_bounds(report).items()},
         "layout_margin_sigma_mm": mm(report.margin.sigma_m),
@@ -224,7 +224,7 @@ _NO_BOUND = BoundedLength(np.inf, np.inf, np.inf)
 
 
 def _least(centres: Array, joint: Array | None, matches: Confusions) -> BoundedLength:
-    """The least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
+    """Return the least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
     if joint is None:
         least = float(matches.misfit.min())
         return BoundedLength(least, least, least)
@@ -234,7 +234,7 @@ def _least(centres: Array, joint: Array | None, matches: Confusions) -> BoundedL
 
 
 def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> BoundedLength:
-    """RMS height over the best plane, with the first-order variance of a singular value."""
+    """Return the RMS height over the best plane, with the first-order variance of a singular value."""
     n = len(centres)
     depth = float(singular[2] / np.sqrt(n))
     if joint is None:
@@ -246,7 +246,7 @@ def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) ->
 
 
 def _joint(covariance: Array | None, n: int) -> Array | None:
-    """(3N, 3N) covariance of all centres; None if nothing is known."""
+    """Return (3N, 3N) covariance of all centres; None if nothing is known."""
     if covariance is None or covariance.ndim == 2:
         return covariance
     joint = np.zeros((n, 3, n, 3))

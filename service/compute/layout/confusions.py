@@ -35,7 +35,7 @@ def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
 
 
 def _rigid_motions(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array]:
-    """R (M, 3, 3) and t (M, 3) of the rigid motion that best maps `seen` onto `taken`."""
+    """Return R (M, 3, 3) and t (M, 3) of the rigid motion that best maps `seen` onto `taken`."""
     _, _, R, _ = _aligned(centres, seen, taken)  # a ≈ R b
     turned = np.swapaxes(R, 1, 2)
     return turned, centres[taken].mean(axis=1) - np.einsum("mij,mj->mi", turned, centres[seen].mean(axis=1))
@@ -53,7 +53,7 @@ def _aligned(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Ar
 
 
 def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: IntArray) -> BoundedMisfits:
-    """Misfits of assignments (M, n) and one-sided bounds with probability CONFIDENCE each.
+    """Return the misfits of assignments (M, n) and one-sided bounds with probability CONFIDENCE each.
 
     The residuals r after the best motion have the covariance Q of the noise, less what a rigid motion absorbs. Then
     |r|² has the mean |r₀|² + tr Q and the variance 2 tr Q² + 4 r₀ᵀ Q r₀, with r₀ the true residuals; a gamma
@@ -102,7 +102,7 @@ def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: In
 
 
 def _residual_covariance(covariance: Array, a: Array, R: Array, seen: IntArray, taken: IntArray) -> Array:
-    """(M, 3n, 3n) covariance of the residuals: the noise of both sides, less what a rigid motion absorbs."""
+    """Return (M, 3n, 3n) covariance of the residuals: the noise of both sides, less what a rigid motion absorbs."""
     M, n = seen.shape
     blocks = covariance.reshape(len(covariance) // 3, 3, -1, 3).transpose(0, 2, 1, 3)  # (N, N, 3, 3)
     ss = blocks[seen[:, :, None], seen[:, None, :]]
@@ -137,7 +137,7 @@ class Confusions:
 
 
 def confusions(centres: Array, beyond_m: float = 0.0) -> Confusions:
-    """All wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
+    """Return all wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
     between = distances(centres)
     tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
     while True:
@@ -150,7 +150,7 @@ def confusions(centres: Array, beyond_m: float = 0.0) -> Confusions:
 
 
 def similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
-    """Quadruples (M, 4) and others (M, 4) with equal pairwise distances, without the quadruple itself."""
+    """Return the quadruples (M, 4) and others (M, 4) with equal pairwise distances, without the quadruple itself."""
     n = len(between)
     seen = np.stack(np.triu_indices(n, 1), axis=1)
     taken = np.array([(p, q) for p in range(n) for q in range(n) if p != q])
@@ -188,7 +188,7 @@ def _extended(between: Array, seen: IntArray, taken: IntArray, tolerance: float)
 
 
 def distances(centres: Array) -> Array:
-    """(N, N) between all centres (N, 3)."""
+    """Return (N, N) distances between all centres (N, 3)."""
     return np.linalg.norm(centres[:, None] - centres[None], axis=2)
 
 

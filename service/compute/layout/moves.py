@@ -46,7 +46,7 @@ class Move:
 
 
 def innermost(centres_m: Array, count: int) -> frozenset[int]:
-    """The `count` spheres nearest to the layout's middle: the control spheres on the specimen."""
+    """Return the `count` spheres nearest to the layout's middle: the control spheres on the specimen."""
     _, _, axes = np.linalg.svd(centres_m - centres_m.mean(axis=0), full_matrices=False)
     flat = (centres_m - centres_m.mean(axis=0)) @ axes[:2].T
     return frozenset(int(i) for i in np.argsort(np.linalg.norm(flat, axis=1), kind="stable")[:count])
@@ -109,7 +109,7 @@ def _moved(centres: Array, sphere: int, by: Array) -> Array:
 
 
 def _quick_rating(centres: Array, required: float) -> float:
-    """The margin over the required one, at most _AMPLE, minus one for each confusable assignment."""
+    """Return the margin over the required one, at most _AMPLE, minus one for each confusable assignment."""
     misfit = misfits(centres, *similar(distances(centres), 2 * np.sqrt(2.0) * _AMPLE * required))
     least = float(misfit.min(initial=_AMPLE * required)) / required
     return least - int(np.count_nonzero(misfit < required))
@@ -129,13 +129,13 @@ def _rating(centres: Array, required: float) -> float:
 
 
 def _around(trial: Array, sphere: int) -> list[Array]:
-    """The layout itself and variants with the sphere slightly displaced."""
+    """Return the layout itself and variants with the sphere slightly displaced."""
     offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * _PLACING_M
     return [_moved(trial, sphere, offset) for offset in offsets]
 
 
 def _involved(centres: Array, fixed: Collection[int], required: float) -> list[int]:
-    """The movable spheres that are most often mistaken for others."""
+    """Return the movable spheres that are most often mistaken for others."""
     found = confusions(centres, beyond_m=2 * required)
     moved = found.seen != found.taken
     count = np.bincount(
@@ -145,7 +145,7 @@ def _involved(centres: Array, fixed: Collection[int], required: float) -> list[i
 
 
 def _directions(up: Array) -> list[Array]:
-    """Shifts along the table combined with height changes, the short ones first."""
+    """Return the shifts along the table combined with height changes, the short ones first."""
     first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)

@@ -124,7 +124,7 @@ def _joined(
     radius_m: float,
     prior: LensPrior,
 ) -> tuple[_Group, AdjustedLayout]:
-    """The group with photograph k added by its best-fitting assignment; unchanged if none fits."""
+    """Return the group with photograph k added by its best-fitting assignment; unchanged if none fits."""
     places = places_by_size(photographs[k].cones, radius_m)
     best: tuple[_Group, AdjustedLayout] | None = None
     best_rank = (True, np.inf)
@@ -186,7 +186,7 @@ def _without_doubles(joined: _Group, adjusted: AdjustedLayout, known: int, radiu
 
 
 def _nearest_m(centres: Array) -> float:
-    """Least distance between two of the centres (N, 3)."""
+    """Return the least distance between two of the centres (N, 3)."""
     return float(distances(centres)[~np.eye(len(centres), dtype=bool)].min())
 
 
@@ -210,14 +210,14 @@ def _reduced(
 
 
 def places_by_size(cones: Sequence[Cone], radius_m: float) -> Array:
-    """(n, 3) centres in the photograph's own frame, with depths from the outlines' sizes."""
+    """Return (n, 3) centres in the photograph's own frame, with depths from the outlines' sizes."""
     return np.array(
         [cone.axis * (radius_m / np.sin(cone.half_angle_rad)) for cone in cones], dtype=np.float64
     ).reshape(-1, 3)
 
 
 def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]]]:
-    """T_a_b and pairs (index in a, index in b) for every way in which b (N, 3) matches a (M, 3), best first.
+    """Return T_a_b and pairs (index in a, index in b) for every way in which b (N, 3) matches a (M, 3), best first.
 
     Nearly symmetric layouts match in more than one way: the adjustment decides between them, and if it cannot, the
     layout is the same either way.
@@ -257,7 +257,7 @@ def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]
 
 
 def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
-    """Index triples (M, 3) into a (its largest triangles only) and into b, with equal sides."""
+    """Return index triples (M, 3) into a (its largest triangles only) and into b, with equal sides."""
     da, db = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
     i, j, k = np.array([(p, q, r) for p in range(len(a)) for q in range(p) for r in range(q)]).T
     area = np.linalg.norm(np.cross(a[j] - a[i], a[k] - a[i]), axis=1)
@@ -278,7 +278,7 @@ def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
 
 
 def _rigid(a: Array, b: Array) -> Array:
-    """T_a_b (M, 4, 4) for point triples a, b (M, 3, 3). Source: as `align_points`."""
+    """Return T_a_b (M, 4, 4) for point triples a, b (M, 3, 3). Source: as `align_points`."""
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=1)
     H = np.einsum("mki,mkj->mij", b - mean_b[:, None], a - mean_a[:, None])
     U, _, Vt = np.linalg.svd(H)

@@ -57,7 +57,7 @@ _DISTINCT = 0.85  # of the larger radius: a sphere closer behind another is too 
 def detect_spheres(
     image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline, ...]:
-    """Outlines of all spheres in an image (H, W, 3), the most certain first; an empty tuple if there are none.
+    """Return outlines of all spheres in an image (H, W, 3), the most certain first; an empty tuple if there are none.
 
     Everything that looks like a sphere is returned; identity and registration decide which are markers.
 
@@ -106,7 +106,7 @@ def confirmed_outlines(
 def _refined(
     image: NDArray[np.uint8], camera: CameraModel, roughs: list[RoughSphere], options: DetectionOptions
 ) -> list[SphereOutline]:
-    """The outlines that are confirmed at full resolution."""
+    """Return the outlines that are confirmed at full resolution."""
     kept: list[SphereOutline] = []
     # In a blurred outline, shading can place the rough outline too far inside.
     for factor in _STARTS:
@@ -128,7 +128,7 @@ def _refined(
 def _confirmed(
     image: NDArray[np.uint8], camera: CameraModel, outline: SphereOutline, options: DetectionOptions
 ) -> SphereOutline | None:
-    """The outline, or a better one near it; None if two different outlines explain the edges.
+    """Return the outline, or a better one near it; None if two different outlines explain the edges.
 
     If only parts of an outline are visible, shading or a border beside it can be mistaken for the rest.
     """
@@ -152,7 +152,7 @@ def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) 
 
 
 def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions) -> list[RoughSphere]:
-    """Discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
+    """Return the discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
     scale = min(1.0, options.coarse_width_px / camera.width)
     coarse_camera = camera
     coarse = image_bgr
@@ -179,7 +179,7 @@ def _searched(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """The discs among the candidates, of the given colour if any."""
+    """Return the discs among the candidates, of the given colour if any."""
     edge_map = edges(*colour_gradient(coarse))
     rng = np.random.default_rng(options.seed)
     kept: list[RoughSphere] = []
@@ -235,7 +235,7 @@ def _of_one_colour(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """The discs of the spheres' colour; doubtful ones only if the colour is given or learnt from clear discs."""
+    """Return discs of the spheres' colour; doubtful ones only if the colour is given or learnt from clear discs."""
     if given is not None:
         roughs = [r for r in roughs if share(coarse, camera, r.cone, given) >= _LEAST_SHARE]
     model = _learnt(roughs, options) or given
@@ -285,7 +285,7 @@ class Detector(Protocol):
     def __call__(
         self, image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = ...
     ) -> tuple[SphereOutline, ...]:
-        """The outlines, the most certain first."""
+        """Return the outlines, the most certain first."""
         ...
 
 

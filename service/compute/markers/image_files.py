@@ -74,7 +74,7 @@ class LocatedOutlines:
     anchors: tuple[int, ...] = ()
 
     def count(self, how: Literal["searched", "predicted"]) -> int:
-        """Number of images whose outlines were found in this way."""
+        """Return the number of images whose outlines were found in this way."""
         return sum(image.how == how for image in self.images)
 
 
@@ -87,7 +87,7 @@ class _Task:
 
 
 def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The outlines in one image file, searched whole.
+    """Return the outlines in one image file, searched whole.
 
     Raises:
         DataError: the file is missing, truncated, no image or not of the camera's size; `where` names it.
@@ -215,7 +215,7 @@ def search_nearby(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
-    """The outlines around expected spheres of image files, as `find_nearby` finds them in each.
+    """Return the outlines around expected spheres of image files, as `find_nearby` finds them in each.
 
     Raises:
         DataError: an image cannot be used; the message names the first one.
@@ -233,7 +233,7 @@ def _nearby(
 
 
 def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutlines:
-    """`LocatedOutlines` for images searched whole, as by `detect_all`."""
+    """Return `LocatedOutlines` for images searched whole, as by `detect_all`."""
     return LocatedOutlines(tuple(outlines), None, tuple(ImageSearch("searched") for _ in outlines))
 
 
@@ -243,7 +243,7 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageO
 
 @contextmanager
 def _mapping(workers: int, items: int) -> Generator[MapFunction]:
-    """A map over processes, or the plain one for a single worker."""
+    """Provide a map over processes, or the plain one for a single worker."""
     if workers <= 1 or items <= 1:
         yield map
         return
@@ -275,7 +275,7 @@ class MapFunction(Protocol):
     """`map`, in this process or over several."""
 
     def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
-        """The results of `work` on the items, in their order."""
+        """Return the results of `work` on the items, in their order."""
         ...
 
 
@@ -308,7 +308,7 @@ def _register_anchors(
     options: DetectionOptions,
     map_over: MapFunction,
 ) -> AnchorRegistration | None:
-    """The registration of a few images of each of the `sets`; None if no reliable one is found."""
+    """Return the registration of a few images of each of the `sets`; None if no reliable one is found."""
     seen: dict[int, tuple[SphereOutline, ...]] = {}
     look = partial(_look_reduced, camera=images.camera, options=options)
     nothing: tuple[SphereOutline, ...] = ()
@@ -357,7 +357,7 @@ def _provisional(
 
 
 def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The clearest outlines of an anchor; identification needs only some, so doubtful ones are dropped."""
+    """Return the clearest outlines of an anchor; identification needs only some, so doubtful ones are dropped."""
     image, smaller = read_reduced(path, camera, ANCHOR_WIDTH_PX)
     few = dataclasses.replace(options, max_candidates=min(_ANCHOR_CANDIDATES, options.max_candidates))
     roughs = find_rough(image, smaller, few)
@@ -407,7 +407,7 @@ def _unlisted(
     spheres: Array,
     radius_m: float,
 ) -> Array:
-    """(U, 3) spheres in no list that two anchors show at one place."""
+    """Return (U, 3) spheres in no list that two anchors show at one place."""
     rays: list[tuple[int, Array, Array, float]] = []  # image, origin, direction, half angle
     for i, found in enumerate(outlines):
         T = T_scan_camera[i]

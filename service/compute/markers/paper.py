@@ -89,7 +89,7 @@ def detect_by_masks(
 
 
 def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULTS) -> list[Box]:
-    """Boxes around what may be a sphere, the most certain first."""
+    """Return the boxes around what may be a sphere, the most certain first."""
     scale = min(1.0, options.coarse_width_px / image_bgr.shape[1])
     small = image_bgr
     if scale < 1:
@@ -143,7 +143,7 @@ def in_the_middle(joined: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
 
 
 def cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
-    """The box cropped from the image; beyond the image, its border is repeated."""
+    """Return the box cropped from the image; beyond the image, its border is repeated."""
     height, width = image_bgr.shape[:2]
     rows = np.clip(np.arange(round(box[1]), round(box[3])), 0, height - 1)
     columns = np.clip(np.arange(round(box[0]), round(box[2])), 0, width - 1)
@@ -151,7 +151,7 @@ def cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
 
 
 def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
-    """The ellipse with the fewest false positives and negatives against a mask, from several starts."""
+    """Return the ellipse with the fewest false positives and negatives against a mask, from several starts."""
     side = len(mask)
     rows, columns = np.mgrid[0:side, 0:side].astype(np.float64)
     inside = mask.astype(np.float64)
@@ -197,7 +197,7 @@ def middle_colour(image_bgr: NDArray[np.uint8], ellipse: EllipseEstimate) -> tup
 def _outline(
     image_bgr: NDArray[np.uint8], camera: CameraModel, estimate: EllipseEstimate, options: DetectionOptions
 ) -> SphereOutline | None:
-    """The outline by Canny points in the ellipse's envelope, undistorted and fitted by RANSAC."""
+    """Return the outline by Canny points in the ellipse's envelope, undistorted and fitted by RANSAC."""
     radius = 0.5 * (estimate.a + estimate.b)
     reach = max(3.0, _ENVELOPE * radius)
     half = max(estimate.a, estimate.b) + reach + 4
@@ -293,7 +293,7 @@ def detect_file_by_masks(
 
 
 def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
-    """Boxes by image name from a JSON file, such as Grounding DINO's.
+    """Return the boxes by image name from a JSON file, such as Grounding DINO's.
 
     Raises:
         DataError: the file is not JSON of this form, a box has no area, or an image is not among `names`.

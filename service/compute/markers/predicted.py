@@ -48,7 +48,7 @@ class Tone:
 
 
 def tone_of(outlines: Sequence[SphereOutline]) -> Tone:
-    """The common colour of one or more outlines."""
+    """Return the common colour of one or more outlines."""
     tones = _chromaticity(outlines)
     middle = np.median(tones, axis=0)
     spread = float(np.median(np.linalg.norm(tones - middle, axis=1)))
@@ -134,7 +134,7 @@ def locate_predicted(
     expected: PredictedSpheres,
     options: DetectionOptions = DEFAULTS,
 ) -> PredictedOutlines:
-    """The outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
+    """Return the outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
 
     Each region is searched as far as the prediction may be off. The outlines found must agree with one camera pose
     (the image's own, so the robot's pose may be off) in place, size and colour; spheres that do not are reported as
@@ -192,7 +192,7 @@ def _starts(
     pose: Transform,
     options: DetectionOptions,
 ) -> dict[int, AveragedCone] | None:
-    """Cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
+    """Return cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
 
     None if the approached spheres do not agree on a pose.
     """
@@ -220,7 +220,7 @@ def _within_gate(cone: Cone, predicted: Cone, part: float = 1.0) -> bool:
 
 
 def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
-    """Distance of the centres in radii, and relative difference of the sizes."""
+    """Return the distance of the centres in radii, and relative difference of the sizes."""
     apart = float(np.linalg.norm(cone.axis - predicted.axis))  # of unit vectors: equals a small angle
     half = predicted.half_angle_rad
     return apart / half, abs(cone.half_angle_rad / half - 1.0)
@@ -263,7 +263,7 @@ def visible_cones(
 
 
 def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin: float) -> Cone | None:
-    """The circle near a predicted one, searched in its region at reduced size."""
+    """Return the circle near a predicted one, searched in its region at reduced size."""
     shrink = max(1.0, cone.half_angle_rad * camera.fx / _REGION_RADIUS_PX)
     angle = cone.half_angle_rad * (1.15 + margin)
     rim = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, angle)))
@@ -306,7 +306,7 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
 def _approached_pose(
     image: NDArray[np.uint8], camera: CameraModel, expected: PredictedSpheres, shown: dict[int, Cone]
 ) -> Transform:
-    """The image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
+    """Return image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
     order = _spread({m: cone for m, cone in shown.items() if expected.votes(m)})
     roughs: dict[int, Cone] = {}
     for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):
@@ -322,7 +322,7 @@ def _approached_pose(
 
 
 def _spread(cones: dict[int, Cone]) -> list[int]:
-    """The spheres in an order in which each is as far as possible from those before it."""
+    """Return the spheres in an order in which each is as far as possible from those before it."""
     if not cones:
         return []
     names = list(cones)
@@ -339,7 +339,7 @@ def _spread(cones: dict[int, Cone]) -> list[int]:
 def _agreed_pose(
     cones: dict[int, Cone], expected: PredictedSpheres, start: Transform, gate: float, least: float
 ) -> Transform | None:
-    """T_camera_scan on which `least` cones (at least three) agree; None if they do not."""
+    """Return T_camera_scan on which `least` cones (at least three) agree; None if they do not."""
     if len(cones) < _POSE_SPHERES:
         return None
     index = list(cones)

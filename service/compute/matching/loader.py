@@ -108,7 +108,7 @@ class MatchingData:
         return set(self._views)
 
     def view(self, name: str) -> View:
-        """A view with its depth, read from its file at each call."""
+        """Return a view with its depth, read from its file at each call."""
         record = self._views[name]
         # Opened here: of a damaged archive, NumPy leaves the file open.
         with (self._folder / record["depth"]).open("rb") as file, np.load(file) as archive:
@@ -117,7 +117,7 @@ class MatchingData:
         return View(self._folder / record["image"], K, T_world_camera, depth_m)
 
     def correspondences(self, pair: Pair, step: int = 1) -> Correspondences:
-        """Those of every `step`-th pixel and row of the first image that has ground truth."""
+        """Return those of every `step`-th pixel and row of the first image that has ground truth."""
         return correspondences(self.view(pair["first"]), self.view(pair["second"]), step=step)
 
 
@@ -140,13 +140,13 @@ def correspondences(first: View, second: View, pixels: Array | None = None, *, s
 
 
 def _with_ground_truth(depth_m: NDArray[np.float32], step: int) -> Array:
-    """(N, 2) every `step`-th pixel and row that has a depth."""
+    """Return (N, 2) every `step`-th pixel and row that has a depth."""
     v, u = np.nonzero(depth_m[::step, ::step] > 0)
     return np.stack([u, v], axis=1).astype(np.float64) * step
 
 
 def look_up(world_m: Array, view: View) -> tuple[Array, NDArray[np.uint8]]:
-    """Pixels (N, 2) of points (N, 3) of the surface in a view, and their status (N,); NaN points are UNKNOWN.
+    """Return pixels (N, 2) of points (N, 3) of the surface in a view, and their status (N,); NaN points are UNKNOWN.
 
     At the outline of what hides a point, the status is exact to a pixel.
     """
@@ -190,7 +190,7 @@ def surface_depth(depth_m: NDArray[np.float32], K: Array, pixels: Array) -> Arra
 
 
 def _around(depth_m: NDArray[np.float32], pixels: Array) -> tuple[Array, Array]:
-    """Depth (N, 4) at the four pixels around each place, and their bilinear weights (N, 4)."""
+    """Return the depth (N, 4) at the four pixels around each place, and their bilinear weights (N, 4)."""
     height, width = depth_m.shape
     placed = np.nan_to_num(pixels, nan=0.0)
     u = np.clip(np.floor(placed[:, 0]).astype(np.int64), 0, max(width - 2, 0))

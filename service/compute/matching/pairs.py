@@ -32,12 +32,12 @@ class Covisibility:
     overlap: Array = field(repr=False)
 
     def pairs(self, least_overlap: float = LEAST_OVERLAP) -> list[tuple[int, int]]:
-        """Pairs of views, first < second, whose overlap is at least this in both directions."""
+        """Return the pairs of views, first < second, whose overlap is at least this in both directions."""
         both = np.minimum(self.overlap, self.overlap.T) >= least_overlap
         return [(int(i), int(j)) for i, j in np.argwhere(np.triu(both & (self.common > 0), k=1))]
 
     def components(self, least_overlap: float = LEAST_OVERLAP) -> NDArray[np.int64]:
-        """(V,) number of the connected part of the graph of these pairs that each view belongs to."""
+        """Return (V,) number of the connected part of the graph of these pairs that each view belongs to."""
         edges = np.array(self.pairs(least_overlap), dtype=np.int64).reshape(-1, 2)
         n = len(self.seen)
         graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
@@ -51,7 +51,7 @@ def points_seen(points_m: Array, view: View) -> NDArray[np.bool_]:
 
 
 def covisibility(seen: NDArray[np.bool_]) -> Covisibility:
-    """Overlaps of views that see these points (V, P), which lie evenly on the surface.
+    """Return the overlaps of views that see these points (V, P), which lie evenly on the surface.
 
     The overlap of a with b is |points of both| / |points of a|. Only the numerator is symmetric: a close view may lie
     within a far one.
@@ -64,12 +64,12 @@ def covisibility(seen: NDArray[np.bool_]) -> Covisibility:
 
 
 def relative_pose(T_world_first: Transform, T_world_second: Transform) -> Transform:
-    """T_second_first (4, 4): maps points of the first camera's frame to the second's."""
+    """Return T_second_first (4, 4): maps points of the first camera's frame to the second's."""
     return inverse(T_world_second) @ T_world_first
 
 
 def relative_covariance(T_world_first: Transform, T_world_second: Transform, joint: Array) -> Array:
-    """(6, 6) covariance of T_second_first from the joint covariance of both poses.
+    """Return (6, 6) covariance of T_second_first from the joint covariance of both poses.
 
     Perturbations are those of the conventions, exp([w]x) R and t + d. With R, t of the second pose and R', t' of the
     first, the relative rotation R^T R' becomes R^T exp(-[w]x) exp([w']x) R', and the relative position R^T (t' - t)
@@ -126,7 +126,7 @@ class Difficulty:
 
 
 def difficulty(common_m: Array, first: View, second: View, overlap: float) -> Difficulty:
-    """The difficulty of a pair with these common points (N, 3), N > 0, in the world frame."""
+    """Return the difficulty of a pair with these common points (N, 3), N > 0, in the world frame."""
     rays = [common_m - view.T_world_camera[:3, 3] for view in (first, second)]
     cosine = np.sum(rays[0] * rays[1], axis=1) / np.prod([np.linalg.norm(ray, axis=1) for ray in rays], axis=0)
     angle_rad = float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
@@ -159,7 +159,7 @@ class ListedPair:
     covariance: Array | None = field(repr=False)
 
     def record(self) -> Pair:
-        """The pair as pairs.json has it."""
+        """Return the pair as pairs.json has it."""
         return {
             "first": self.first,
             "second": self.second,
@@ -210,6 +210,6 @@ def listed_pairs(
 
 
 def _of_pair(errors: Array, i: int, j: int) -> Array:
-    """(12, 12) part of a joint covariance that belongs to two poses."""
+    """Return (12, 12) part of a joint covariance that belongs to two poses."""
     rows = np.concatenate([6 * i + np.arange(6), 6 * j + np.arange(6)])
     return errors[np.ix_(rows, rows)]

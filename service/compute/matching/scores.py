@@ -38,7 +38,7 @@ def match_errors_px(matches: Matches, first: View, second: View) -> Array:
 
 
 def precisions(errors_px: Array) -> tuple[float, ...]:
-    """Share of the scored matches within each of PRECISION_PX; 0 if none is scored."""
+    """Return the share of the scored matches within each of PRECISION_PX; 0 if none is scored."""
     scored = errors_px[~np.isnan(errors_px)]
     return tuple(float(np.mean(scored < limit)) if len(scored) else 0.0 for limit in PRECISION_PX)
 
@@ -50,7 +50,7 @@ def fundamental_matrix(T_second_first: Transform, K_first: Array, K_second: Arra
 
 
 def epipolar_errors_px(matches: Matches, F: Array) -> Array:
-    """(M,) mean distance of both pixels of a match from the epipolar line of the other."""
+    """Return (M,) mean distance of both pixels of a match from the epipolar line of the other."""
     first, second = (
         np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
         for pixels in (matches.first_px, matches.second_px)
@@ -88,7 +88,7 @@ class PoseError:
 
 
 def pose_from_matches(matches: Matches, K_first: Array, K_second: Array) -> tuple[Array, Array, int]:
-    """Rotation (3, 3), direction (3,) of the translation of T_second_first, and the number of inliers.
+    """Return the rotation (3, 3), direction (3,) of the translation of T_second_first, and the number of inliers.
 
     An essential matrix by MAGSAC++ (Barath et al., CVPR 2020), as OpenCV's USAC has it, with a threshold of INLIER_PX
     in images of the mean focal length. The same matches give the same pose.
@@ -120,7 +120,7 @@ def pose_from_matches(matches: Matches, K_first: Array, K_second: Array) -> tupl
 
 
 def pose_error(R: Array, direction: Array, T_second_first: Transform) -> PoseError:
-    """The error of a rotation (3, 3) and a direction (3,) of translation."""
+    """Return the error of a rotation (3, 3) and a direction (3,) of translation."""
     rotation_rad = float(Rotation.from_matrix(R @ T_second_first[:3, :3].T).magnitude())
     true = T_second_first[:3, 3]
     cosine = float(direction @ true / max(np.linalg.norm(direction) * np.linalg.norm(true), 1e-300))
@@ -128,7 +128,7 @@ def pose_error(R: Array, direction: Array, T_second_first: Transform) -> PoseErr
 
 
 def auc(errors_deg: Sequence[float], threshold_deg: float) -> float:
-    """Area under the cumulative curve of pose errors up to a threshold, over the threshold: 0 to 1.
+    """Return the area under the cumulative curve of pose errors up to a threshold, over the threshold: 0 to 1.
 
     Defined as in Sarlin et al. (SuperGlue, CVPR 2020) and later work. The curve is piecewise linear from (0, 0)
     through (error k, k / n), with the errors in order, and level from the last error below the threshold. A pair
@@ -190,7 +190,7 @@ def chosen_pairs(pairs: Sequence[Pair], per_class: int) -> list[Pair]:
 
 
 def evaluate(match: Match, data: MatchingData, pairs: Sequence[Pair], progress: Progress) -> list[PairScore]:
-    """The scores of a method on pairs. It is given their pictures alone; poses and depth only judge it.
+    """Return the scores of a method on pairs. It is given their pictures alone; poses and depth only judge it.
 
     Raises:
         DataError: a file of the data set cannot be read.
@@ -208,7 +208,7 @@ def evaluate(match: Match, data: MatchingData, pairs: Sequence[Pair], progress: 
 
 
 def score_pair(found: Matches, pair: Pair, first: View, second: View, seconds: float) -> PairScore:
-    """The score of the matches of a pair."""
+    """Return the score of the matches of a pair."""
     T_second_first = np.array(pair["T_second_first"])
     errors = match_errors_px(found, first, second)
     epipolar = epipolar_errors_px(found, fundamental_matrix(T_second_first, first.K, second.K))
@@ -239,7 +239,7 @@ class LoadedViews:
         self._known: OrderedDict[str, tuple[View, Picture]] = OrderedDict()
 
     def read(self, name: str) -> tuple[View, Picture]:
-        """A view and its picture.
+        """Return a view and its picture.
 
         Raises:
             DataError: a file cannot be read.

@@ -38,7 +38,7 @@ class Cylinder:
 
 
 def posts_below(spheres: Sequence[WorldSphere], up: Array, length_m: float, radius_m: float) -> tuple[Cylinder, ...]:
-    """A post from the centre of each sphere downwards; `up` (3,) is a unit vector in the world frame."""
+    """Return a post from the centre of each sphere downwards; `up` (3,) is a unit vector in the world frame."""
     return tuple(Cylinder(sphere.centre_m, sphere.centre_m - length_m * up, radius_m) for sphere in spheres)
 
 
@@ -80,7 +80,7 @@ def hull_mask(camera: CameraModel, T_world_camera: Transform, points_m: Array) -
 
 
 def _hull(points: Array) -> Array:
-    """Rays (K, 3) of the outline of points (N, 3) before the camera."""
+    """Return the rays (K, 3) of the outline of points (N, 3) before the camera."""
     flat = (points[:, :2] / points[:, 2:]).astype(np.float32)
     if len(flat) < 3:
         return np.empty((0, 3))
@@ -96,7 +96,7 @@ def _sphere_outline(centre: Array, radius_m: float) -> Array:
 
 
 def _post_outline(ends: Array, radius_m: float) -> Array:
-    """Rays (N, 3) of the outline: the convex hull of the images of both ends."""
+    """Return the rays (N, 3) of the outline: the convex hull of the images of both ends."""
     near = 2 * radius_m
     low, high = ends[np.argsort(ends[:, 2])]
     if high[2] <= near:
@@ -111,7 +111,7 @@ def _post_outline(ends: Array, radius_m: float) -> Array:
 
 
 def _frustum(rays: PixelRays, camera: CameraModel) -> Array:
-    """(5, 3) planes with n · ray >= 0 for all rays of the image and a margin around it."""
+    """Return (5, 3) planes with n · ray >= 0 for all rays of the image and a margin around it."""
     edge = np.concatenate([rays.xy(0, 1)[0], rays.xy(camera.height - 1, camera.height)[0]])
     sides = np.einsum("vk,kuc->vuc", rays.rows, rays.columns[:, [0, -1]]).reshape(-1, 2)
     margin = _MARGIN_PX / np.array([camera.fx, camera.fy])
@@ -135,7 +135,7 @@ def _fill(mask: NDArray[np.uint8], camera: CameraModel, frustum: Array, outline:
 
 
 def _cut(polygon: Array, plane: Array) -> Array:
-    """The part of a convex polygon of rays (N, 3) with plane · ray >= 0 (Sutherland and Hodgman, 1974)."""
+    """Return the part of a convex polygon of rays (N, 3) with plane · ray >= 0 (Sutherland and Hodgman, 1974)."""
     kept: list[Array] = []
     height = polygon @ plane
     for i in range(len(polygon)):

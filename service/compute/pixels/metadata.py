@@ -102,7 +102,7 @@ class _BrokenMetadataError(DataError):
 
 
 def _changed(picture: bytes, change: Callable[[Any], object], where: str) -> bytes:
-    """The picture with its metadata changed; broken metadata of a JPEG are dropped before."""
+    """Return the picture with its metadata changed; broken metadata of a JPEG are dropped before."""
     try:
         return _written(picture, change, where)
     except _BrokenMetadataError:

@@ -38,7 +38,7 @@ class PixelRays:
     columns: Array
 
     def xy(self, begin: int, end: int) -> Array:
-        """(end - begin, width, 2) undistorted x/z, y/z of the pixel centres of rows [begin, end)."""
+        """Return (end - begin, width, 2) undistorted x/z, y/z of the pixel centres of rows [begin, end)."""
         flat = self.columns.reshape(len(self.columns), -1)
         return (self.rows[begin:end] @ flat).reshape(end - begin, self.width, 2)
 
@@ -50,7 +50,7 @@ class PixelRays:
 
 
 def pixel_rays(camera: CameraModel) -> PixelRays:
-    """The rays of a camera, distorted or not; pixel centres lie at integer coordinates.
+    """Return the rays of a camera, distorted or not; pixel centres lie at integer coordinates.
 
     The inverse of the distortion has no closed form. It is interpolated at Chebyshev nodes of the whole image, which
     converges geometrically for a smooth function (Trefethen, "Approximation Theory and Approximation Practice",
@@ -95,7 +95,7 @@ def _interpolated(camera: CameraModel, degree: int) -> PixelRays:
 
 
 def _basis(size: int, degree: int) -> Array:
-    """(size, degree + 1) Chebyshev polynomials at the pixel centres."""
+    """Return (size, degree + 1) Chebyshev polynomials at the pixel centres."""
     return np.asarray(chebyshev.chebvander(np.linspace(-1.0, 1.0, size), degree), dtype=np.float64)
 
 
@@ -138,7 +138,7 @@ class RayMesh:
         return _tree(self._near, self._faces)
 
     def first_face(self, eye_m: Array, directions: NDArray[np.float32]) -> NDArray[np.int32]:
-        """The index (N,) of the first face that each ray from the eye (3,) along (N, 3) hits; -1 for none.
+        """Return the index (N,) of the first face that each ray from the eye (3,) along (N, 3) hits; -1 for none.
 
         Raises:
             ConfigurationError: embreex, which casts the rays, is not installed.
@@ -173,7 +173,7 @@ class RayMesh:
 
 
 def _planes(vertices_m: Array, faces: NDArray[np.integer]) -> tuple[Array, Array]:
-    """Unit normals (F, 3) and offsets n · p (F,); NaN for faces without area."""
+    """Return the unit normals (F, 3) and offsets n · p (F,); NaN for faces without area."""
     normal, offset = np.empty((len(faces), 3)), np.empty(len(faces))
     for begin in range(0, len(faces), _CHUNK):
         chosen = slice(begin, begin + _CHUNK)
@@ -254,7 +254,7 @@ def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) 
 
 
 def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: int) -> SurfaceRows:
-    """Depth and normal of the rays of some rows on the planes (N, 4) of the faces that they hit."""
+    """Return the depth and normal of the rays of some rows on the planes (N, 4) of the faces that they hit."""
     plane = planes.reshape(end - begin, rays.width, 4)
     xy = rays.xy(begin, end)
     slope = plane[..., 0] * xy[..., 0]
@@ -326,7 +326,7 @@ def seen_points(
 def covered_shares(
     counts: NDArray[np.int64], points_m: Array, triangles: NDArray[np.int64], at_least: Sequence[int]
 ) -> tuple[float, ...]:
-    """Share of a mesh's area that at least so many views see, for each number in `at_least`.
+    """Return the share of a mesh's area that at least so many views see, for each number in `at_least`.
 
     Args:
         counts: (V,) views that see each vertex.

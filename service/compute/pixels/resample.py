@@ -34,12 +34,12 @@ class Undistorted:
 
 
 def pinhole_of(camera: CameraModel) -> CameraModel:
-    """The camera without its distortion: same size, focal lengths and principal point."""
+    """Return the camera without its distortion: same size, focal lengths and principal point."""
     return dataclasses.replace(camera, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
 
 
 def undistorted(image: NDArray[np.uint8], camera: CameraModel) -> Undistorted:
-    """The photograph (H, W) or (H, W, 3) as the pinhole camera `pinhole_of(camera)` would have taken it.
+    """Return the photograph (H, W) or (H, W, 3) as the pinhole camera `pinhole_of(camera)` would have taken it.
 
     Cubic interpolation at places rounded to 1/32 px, in tiles of rows.
     """
@@ -56,7 +56,7 @@ def undistorted(image: NDArray[np.uint8], camera: CameraModel) -> Undistorted:
 
 
 def valid_pixels(camera: CameraModel) -> NDArray[np.bool_]:
-    """(H, W) pixels of the undistorted image for which the photograph has one."""
+    """Return (H, W) pixels of the undistorted image for which the photograph has one."""
     valid = np.empty((camera.height, camera.width), dtype=np.bool_)
     for begin, end, at in _places(pinhole_of(camera), camera):
         valid[begin:end] = _within(at, camera)
@@ -80,7 +80,7 @@ def _within(at: Array, camera: CameraModel) -> NDArray[np.bool_]:
 
 
 def camera_at(camera: CameraModel, width: int, height: int) -> CameraModel:
-    """The camera of the image that `resample` returns.
+    """Return the camera of the image that `resample` returns.
 
     Raises:
         ConfigurationError: the size is larger than the photograph.

@@ -56,7 +56,7 @@ class Contact:
     clearance_m: float  # negative: depth of the overlap
 
     def __str__(self) -> str:
-        """The contact in words, for a technician."""
+        """Return the contact in words, for a technician."""
         if self.clearance_m < 0:
             return f"the {self.first} would touch the {self.second}"
         return f"the {self.first} would come within {mm(self.clearance_m):.0f} mm of the {self.second}"
@@ -203,7 +203,7 @@ class Freedom:
 
 
 def detour(start_rad: Array, end_rad: Array, freedom: Freedom) -> Array | None:
-    """Joints (M, N) to go through from start to end (N,), each on a straight way; None if none was found.
+    """Return the joints (M, N) to go through from start to end (N,), each on a straight way; None if none was found.
 
     Two trees grow from the ends towards drawn joints and towards each other (RRT-Connect: Kuffner and LaValle, ICRA
     2000); the way is then shortened. It is deterministic. That none was found does not prove that there is none.
@@ -272,7 +272,7 @@ class _Tree:
         return len(self.parents) - 1
 
     def way_to(self, index: int) -> list[Array]:
-        """The joints from the first to this one."""
+        """Return the joints from the first to this one."""
         way: list[Array] = []
         while index >= 0:
             way.append(self.joints_rad[index])
@@ -281,7 +281,7 @@ class _Tree:
 
 
 def _shortened(way: Array, freedom: Freedom, rng: np.random.Generator) -> Array:
-    """The way (K, N) without joints that a straight way can leave out."""
+    """Return the way (K, N) without joints that a straight way can leave out."""
     for _ in range(_SHORTENINGS):
         if len(way) < 3:
             return way

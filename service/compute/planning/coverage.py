@@ -57,7 +57,7 @@ class CoverageSurface:
         return RayMeshIntersector(trimesh.Trimesh(self.occluder_vertices_m, self.occluder_faces, process=False))
 
     def free(self, origins: Array, target: Array) -> NDArray[np.bool_]:
-        """(K,) whether the line from origins (K, 3) to `target` (3,) or targets (K, 3) is unobstructed."""
+        """Return (K,) whether the line from origins (K, 3) to `target` (3,) or targets (K, 3) is unobstructed."""
         if self.rays is None or len(origins) == 0:
             return np.ones(len(origins), dtype=bool)
         return ~np.asarray(self.rays.intersects_any(origins, target - origins), dtype=bool)
@@ -132,14 +132,14 @@ def seen(
 
 
 def covered_fraction(views: Sequence[NDArray[np.bool_]], min_views: int) -> float:
-    """Share of the points seen in at least `min_views` of the views (N,); 0 without views."""
+    """Return the share of the points seen in at least `min_views` of the views (N,); 0 without views."""
     if not views:
         return 0.0
     return float(np.mean(np.sum(views, axis=0) >= min_views))
 
 
 def _all_near(near: NDArray[np.bool_], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """(F,) whether all corners of a face are near."""
+    """Return (F,) whether all corners of a face are near."""
     return near[faces[:, 0]] & near[faces[:, 1]] & near[faces[:, 2]]
 
 
@@ -161,7 +161,7 @@ def _plane_axes(up: Array) -> Array:
 
 
 def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDArray[np.bool_]:
-    """Points within the hull of the spheres as seen from above, and not on a sphere or its post."""
+    """Return the points within the hull of the spheres as seen from above, and not on a sphere or its post."""
     axes = _plane_axes(up)
     flat, feet = points @ axes.T, spheres_m @ axes.T
     hull = ConvexHull(feet)
@@ -174,7 +174,7 @@ def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDA
 
 
 def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArray[np.bool_]:
-    """Points on the plane under the specimen, if one height dominates among the level surfaces."""
+    """Return the points on the plane under the specimen, if one height dominates among the level surfaces."""
     height = (points - centre) @ up
     level = normals @ up > 0.97  # only the top: the underside has the same area
     if level.sum() < 50:
@@ -189,7 +189,7 @@ def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArra
 
 
 def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
-    """Eye positions on a dome of directions around the centre."""
+    """Return the eye positions on a dome of directions around the centre."""
     axes = _plane_axes(up)
     eyes: list[Array] = []
     for tilt in np.radians(_DOME_TILTS_DEG):
@@ -201,7 +201,7 @@ def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
 
 
 def _simplified(surface: Surface) -> tuple[Array, NDArray[np.int64]]:
-    """The mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast.
+    """Return the mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast.
 
     A cell has the place of its vertex that comes first in the faces.
     """

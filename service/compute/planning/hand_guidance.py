@@ -32,14 +32,14 @@ class Attitude:
 
     @classmethod
     def of(cls, R_level_camera: Array) -> Attitude:
-        """The attitude of a rotation matrix R_level_camera (3, 3)."""
+        """Return the attitude of a rotation matrix R_level_camera (3, 3)."""
         x, z = R_level_camera[:, 0], R_level_camera[:, 2]
         turn, lean = float(np.arctan2(x[1], x[0])), float(np.arcsin(np.clip(-x[2], -1.0, 1.0)))
         ahead = (Rotation.from_euler("z", turn) * Rotation.from_euler("y", lean)).inv().apply(z)
         return cls(turn, lean, float(np.arctan2(-ahead[2], ahead[1])))
 
     def matrix(self) -> Array:
-        """(3, 3) R_level_camera."""
+        """Return (3, 3) R_level_camera."""
         turned = Rotation.from_euler("z", self.turn_rad) * Rotation.from_euler("y", self.lean_rad)
         return np.asarray((turned * Rotation.from_euler("x", -self.tilt_rad)).as_matrix() @ _FORWARD)
 
@@ -54,7 +54,7 @@ class WantedView:
 
 
 def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
-    """T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along the level part of `top` (3,)."""
+    """Return T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along the level part of `top` (3,)."""
     z = up / np.linalg.norm(up)
     y = top - z * (top @ z)
     if np.linalg.norm(y) < 1e-6:
@@ -64,7 +64,7 @@ def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
 
 
 def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
-    """The normal (3,) of the best plane through the spheres (M, 3), towards the camera at `eye_m` (3,)."""
+    """Return the normal (3,) of the best plane through the spheres (M, 3), towards the camera at `eye_m` (3,)."""
     middle = spheres_m.mean(axis=0)
     normal = np.linalg.svd(spheres_m - middle)[2][2]
     return np.asarray(normal if (eye_m - middle) @ normal > 0 else -normal, dtype=np.float64)
@@ -95,7 +95,7 @@ def place_at(
 
 
 def words(T_level_here: Transform, T_level_there: Transform) -> str:
-    """Words such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
+    """Return words such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
 
     Both poses are in the level frame. Left, right, forward and back are those of a holder who looks in the direction
     of the image's top; the camera is first moved, then turned. Empty if there is nothing to change.
@@ -126,7 +126,7 @@ def _angle(radians: float, verb: str, positive: str, negative: str) -> str:
 
 
 def covered(places: Iterable[WantedView], T_level_cameras: Sequence[Transform], within_deg: float) -> set[str]:
-    """Names of the places that an image covers: position and axis agree within `within_deg`."""
+    """Return the names of the places that an image covers: position and axis agree within `within_deg`."""
     limit = np.cos(np.deg2rad(within_deg))
     done: set[str] = set()
     for place in places:

@@ -37,7 +37,7 @@ def depth_of_field(
 
 
 def depths_m(T_base_camera: Transform, points_base_m: Array) -> tuple[float, float]:
-    """Least and greatest depth along the optical axis of points (N, 3) in base coordinates, metres."""
+    """Return the least and greatest depth along the optical axis of points (N, 3) in base coordinates, metres."""
     depth = apply(inverse(T_base_camera), points_base_m)[:, 2]
     return float(np.min(depth)), float(np.max(depth))
 
@@ -170,7 +170,7 @@ def plan_motion(
 
 
 def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, scene: PlanningScene) -> str:
-    """Why a pose cannot be taken; "" if it can."""
+    """Return why a pose cannot be taken; "" if it can."""
     if joints_rad is None:
         return "the arm does not reach it"
     contact = nearest_contacts(scene.body, scene.obstacles, joints_rad[None])[0]
@@ -197,13 +197,13 @@ def travel_times_s(joints_rad: Array, scene: PlanningScene) -> Array:
 
 
 def _legs_s(joints_rad: Array, scene: PlanningScene) -> Array:
-    """(K - 1,) time from each of the joint positions (K, N) to the next."""
+    """Return (K - 1,) time from each of the joint positions (K, N) to the next."""
     turns = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
     return turn_times_s(turns, scene.speed_rad_s, scene.acceleration_rad_s2)
 
 
 def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: float) -> Array:
-    """Time for joints to turn by angles of any shape: ramp up, constant speed if reached, ramp down."""
+    """Return the time for joints to turn by angles of any shape: ramp up, constant speed if reached, ramp down."""
     v, a = speed_rad_s, acceleration_rad_s2
     return np.where(turns_rad > v**2 / a, turns_rad / v + v / a, 2 * np.sqrt(turns_rad / a))
 
@@ -258,7 +258,7 @@ def _length(path: Sequence[int], times_s: Array) -> float:
 
 
 def _place(name: str, T_base_camera: Transform, best: Array | None, scene: PlanningScene) -> PlannedView:
-    """The view with its best posture (N,); without one, turned until there is one, or refused."""
+    """Return the view with its best posture (N,); without one, turned until there is one, or refused."""
     if best is not None:
         return PlannedView(name, T_base_camera, "feasible", joints_rad=best)
     nearest = next(iter(_postures(T_base_camera, scene)), None)
@@ -272,20 +272,20 @@ def _place(name: str, T_base_camera: Transform, best: Array | None, scene: Plann
 
 
 def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: float) -> Transform:
-    """The camera pose turned about the vertical through the scene's centre."""
+    """Return the camera pose turned about the vertical through the scene's centre."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return transform(R, centre_m - R @ centre_m) @ T_base_camera
 
 
 def _postures(T_base_camera: Transform, scene: PlanningScene) -> Array:
-    """Joints (K, N) that reach a pose, those nearest to the arm's current ones first."""
+    """Return the joints (K, N) that reach a pose, those nearest to the arm's current ones first."""
     T_base_flange = T_base_camera @ inverse(scene.body.T_flange_camera)
     return postures_near(scene.body.model, T_base_flange, scene.start_rad)
 
 
 def able_postures(T_base_camera: Transform, scene: PlanningScene) -> Iterator[Array]:
-    """Joints (N,) that reach a pose free of collisions and in focus, the best ones first.
+    """Yield the joints (N,) that reach a pose free of collisions and in focus, the best ones first.
 
     With six axes these are nearest to the arm's current ones. With seven, whose elbow is free, more clearance also
     counts, among postures about equally near.
@@ -299,7 +299,7 @@ def able_postures(T_base_camera: Transform, scene: PlanningScene) -> Iterator[Ar
 
 
 def _able(postures_rad: Array, clearances_m: Array, scene: PlanningScene) -> Iterator[Array]:
-    """Those of the postures (K, N), with clearances (K,), that have enough of it, the best ones first."""
+    """Yield those of the postures (K, N), with clearances (K,), that have enough of it, the best ones first."""
     order = range(len(postures_rad))
     if scene.body.model.axes > 6:  # the elbow is free
         tight = np.clip(1 - (clearances_m - scene.margin_m) / _ROOM_M, 0, None)
@@ -309,13 +309,13 @@ def _able(postures_rad: Array, clearances_m: Array, scene: PlanningScene) -> Ite
 
 
 def _clearances_m(postures_rad: Array, scene: PlanningScene) -> Array:
-    """The clearance (K,) at each of the postures (K, N)."""
+    """Return the clearance (K,) at each of the postures (K, N)."""
     contacts = nearest_contacts(scene.body, scene.obstacles, postures_rad)
     return np.array([contact.clearance_m for contact in contacts])
 
 
 def best_postures(T_base_camera: Sequence[Transform], scene: PlanningScene) -> list[Array | None]:
-    """`best_posture` of each of several poses, whose postures are checked together, which takes less time."""
+    """Find `best_posture` of each of several poses, whose postures are checked together, which takes less time."""
     found = [_postures(T, scene) for T in T_base_camera]
     first = [postures_rad[:_AT_ONCE] for postures_rad in found]
     ends = np.cumsum([len(some) for some in first])[:-1]
@@ -328,7 +328,7 @@ def best_postures(T_base_camera: Sequence[Transform], scene: PlanningScene) -> l
 
 
 def best_posture(T_base_camera: Transform, scene: PlanningScene) -> Array | None:
-    """The best of `able_postures`; None if there is none."""
+    """Return the best of `able_postures`; None if there is none."""
     return next(able_postures(T_base_camera, scene), None)
 
 

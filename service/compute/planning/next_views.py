@@ -80,7 +80,7 @@ def predicted_information(
 def cone_rows(
     T_base_camera: Transform, sphere_base_m: Array, centre_m: Array, radius_m: float, seen: Cone
 ) -> tuple[Array, Array]:
-    """Residual (3,) in radians of a sphere's cone as seen, and its derivative (3, 6) by (d, w)."""
+    """Return the residual (3,) in radians of a sphere's cone as seen, and its derivative (3, 6) by (d, w)."""
     c = apply(inverse(T_base_camera), sphere_base_m)
     residual, by_centre = ObservedCones.of([seen]).residuals(c[None], radius_m)
     move = T_base_camera[:3, :3].T @ np.hstack([np.eye(3), -skew(sphere_base_m - centre_m)])  # (3, 6) of c
@@ -88,7 +88,7 @@ def cone_rows(
 
 
 def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: float) -> Array:
-    """Covariance P (6, 6) of a station's camera poses, from the views' scatter and the nominal scatter.
+    """Return the covariance P (6, 6) of a station's camera poses, from the views' scatter and the nominal scatter.
 
     Args:
         views: their offsets scatter by the arm's error and the noise of their outlines.
@@ -125,7 +125,7 @@ def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
 def mounting_covariance(
     views: Iterable[tuple[Array, Transform]], T_flange_camera: Transform, covariance: Array, centre_m: Array
 ) -> Array:
-    """Covariance (6, 6) of the scan's pose due to the uncertain camera mount, which all views share.
+    """Return the covariance (6, 6) of the scan's pose due to the uncertain camera mount, which all views share.
 
     Args:
         views: information (6, 6) and T_base_camera of each; together they must determine the pose.
@@ -146,7 +146,7 @@ def mounting_covariance(
 def lens_covariance_of_pose(
     views: Iterable[tuple[Array, Transform]], camera: CameraModel, covariance: Array, centre_m: Array
 ) -> Array:
-    """Covariance (6, 6) of the scan's pose due to the uncertain calibration, which all views share.
+    """Return the covariance (6, 6) of the scan's pose due to the uncertain calibration, which all views share.
 
     A focal length too long by a share puts the scan nearer by this share of its distance, and a principal point that
     is off puts it aside.
@@ -262,7 +262,7 @@ def _covered(count: NDArray[np.int64], min_views: int) -> float:
 
 
 def _gain(count: NDArray[np.int64], seen: NDArray[np.bool_], min_views: int) -> float:
-    """Progress of all points towards `min_views`, so that a first view of a point counts too."""
+    """Return the progress of all points towards `min_views`, so that a first view of a point counts too."""
     if not len(count):
         return 0.0
     return float(np.mean(np.minimum(count + seen, min_views) - np.minimum(count, min_views))) / min_views

@@ -108,7 +108,7 @@ def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file.
+    """Return the object in a JSON file.
 
     Raises:
         DataError: the file is not JSON, or holds no object.
@@ -120,7 +120,7 @@ def json_object(path: Path) -> dict[str, Any]:
 
 
 def finite_numbers(value: object, where: str) -> Array:
-    """An array of finite numbers from parsed JSON.
+    """Return an array of finite numbers from parsed JSON.
 
     Raises:
         DataError: it is none; `where` names the place.

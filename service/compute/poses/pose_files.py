@@ -30,7 +30,7 @@ HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre,
 
 
 def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Transform]:
-    """T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
+    """Return T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
 
     Args:
         path: file or folder; its kind determines the format.
@@ -62,7 +62,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
 
 
 def _transforms_in(folder: Path) -> Path | None:
-    """The transforms.json of a folder, by this name or another that NeuS2 and Blender's data sets give it.
+    """Return the transforms.json of a folder, by this name or another that NeuS2 and Blender's data sets give it.
 
     Raises:
         DataError: there are several.
@@ -94,7 +94,7 @@ def posed_images(
 def only_posed(
     images: ImageFolder, posed: Collection[str], path: Path, folder: Path, *, strict: bool = False
 ) -> ImageFolder:
-    """The images whose names are among those with a pose in the file `path`; the others are left out.
+    """Return the images whose names are among those with a pose in the file `path`; the others are left out.
 
     Raises:
         DataError: no image has a pose; or, with `strict`, one has none.
@@ -147,7 +147,7 @@ def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> 
 
 
 def read_poses_csv(path: Path) -> dict[str, Transform]:
-    """T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
+    """Return T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
 
     Raises:
         DataError: the file has another form; the message names file:line.
@@ -199,7 +199,7 @@ def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None
 
 
 def read_transforms_json(path: Path) -> dict[str, Transform]:
-    """T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
+    """Return T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
 
     Cameras look along -z, but those of NeuS2's own form and of Mitsuba along +z. Names are the frames' file_path
     without a leading "./". Where `unit_box.json` of our own export lies beside it, positions are taken back to the
@@ -231,7 +231,7 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
 
 
 def _camera_axes(document: Mapping[str, Any]) -> Transform:
-    """The axes of a file's cameras, as `nerf_matrix_to_ngp` of NeuS2 and Instant-NGP takes them.
+    """Return the axes of a file's cameras, as `nerf_matrix_to_ngp` of NeuS2 and Instant-NGP takes them.
 
     They test only whether the keys are there: with `from_na` x is right, y down, z forward, with `normal_mts_args`
     (Mitsuba) x is left, y up, z forward.
@@ -253,7 +253,7 @@ def _centre_beside(path: Path) -> Array:
 
 
 def _rotation(matrix: Array, where: str) -> Array:
-    """The rotation matrix nearest to one that was written with few digits."""
+    """Return the rotation matrix nearest to one that was written with few digits."""
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > 5 * _UNIT or np.linalg.det(matrix) < 0:
         raise DataError(
             "the matrix is not a rotation (scaled, sheared or mirrored)",
@@ -286,7 +286,7 @@ def write_transforms_json(
 
 
 def transforms_intrinsics(camera: CameraModel, *, where: str = "", remedy: str) -> dict[str, float]:
-    """The keys of one camera in transforms.json; nerfstudio, like COLMAP, has the first pixel's corner at 0.
+    """Return the keys of one camera in transforms.json; nerfstudio, like COLMAP, has the first pixel's corner at 0.
 
     Raises:
         DataError: the camera has the rational distortion k4, k5, k6, which the format cannot hold.
@@ -312,7 +312,7 @@ def transforms_intrinsics(camera: CameraModel, *, where: str = "", remedy: str) 
 
 
 def read_colmap_model(folder: Path) -> dict[str, Transform]:
-    """T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
+    """Return T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
 
     Raises:
         DataError: the folder has no model, or it cannot be read.
@@ -340,7 +340,7 @@ def _is_trajectory(table: TextTable) -> bool:
 
 
 def _trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
-    """T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
+    """Return T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
 
     Raises:
         DataError: a line has another form, or a timestamp occurs twice; the message names file:line.
@@ -433,12 +433,12 @@ def _match(
 
 
 def _file(name: str) -> str:
-    """The file's name without its folders, whichever system wrote the path."""
+    """Return the file's name without its folders, whichever system wrote the path."""
     return PurePosixPath(_DRIVE.sub("", name.strip().replace("\\", "/"), count=1)).name
 
 
 def _composed(name: str) -> str:
-    """The file's name with composed letters: macOS stores ä as a and two dots."""
+    """Return the file's name with composed letters: macOS stores ä as a and two dots."""
     return unicodedata.normalize("NFC", _file(name))
 
 
@@ -451,5 +451,5 @@ def _stem(name: str) -> str:
 
 
 def some_names(names: Sequence[str]) -> str:
-    """The first names of several, for messages."""
+    """Return the first names of several, for messages."""
     return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

@@ -83,14 +83,14 @@ class RobotPoseTable:
     plain: bool
 
     def poses(self, form: RotationForm | None = None) -> Array:
-        """(M, 4, 4) poses with positions in metres, with the rotations in this form or the file's."""
+        """Return (M, 4, 4) poses with positions in metres, with the rotations in this form or the file's."""
         out = np.tile(np.eye(4), (len(self.position), 1, 1))
         out[:, :3, :3] = _matrices(self.rotation, form or self.form)
         out[:, :3, 3] = METRES_PER[self.unit] * self.position
         return out
 
     def other_readings(self) -> Iterator[tuple[Array, str, str]]:
-        """(M, 4, 4) poses by each other form of rotation, in words after "they fit", and what to do."""
+        """Yield (M, 4, 4) poses by each other form of rotation, in words after "they fit", and what to do."""
         for form in _forms(self.rotation.shape[1]):
             if form != self.form:
                 yield self.poses(form), f"with the rotations {_WORDS[form]}", f"Give --rotation {form}"
@@ -192,7 +192,7 @@ def other_orders(rows: Mapping[str, int]) -> Iterator[tuple[dict[str, int], str]
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts names by the numbers in them: 2 before 10."""
+    """Return a key that sorts names by the numbers in them: 2 before 10."""
     return [
         (0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part
     ]
@@ -211,7 +211,7 @@ class _Columns:
 
 
 def _cells(row: Sequence[str]) -> list[str]:
-    """The cells of a row without p[ … ], as URScript writes a pose."""
+    """Return the cells of a row without p[ … ], as URScript writes a pose."""
     return [re.sub(r"^\s*(p?\[)|\]\s*$", "", cell).strip() for cell in row]
 
 
@@ -258,7 +258,7 @@ def _number(cell: str) -> float | None:
 
 
 def _bare(cell: str) -> str:
-    """A column's name without its unit: `X [mm]`, `x_mm` and `x(m)` are x."""
+    """Return a column's name without its unit: `X [mm]`, `x_mm` and `x(m)` are x."""
     return re.sub(r"([\s_]*[\[(].*|_(mm|cm|m|in|deg|rad))$", "", cell.strip().lower())
 
 
@@ -288,7 +288,7 @@ def _forms(numbers: int) -> tuple[RotationForm, ...]:
 
 
 def _matrices(rotation: Array, form: RotationForm) -> Array:
-    """(M, 3, 3) rotations."""
+    """Return (M, 3, 3) rotations."""
     return _MAKE[form.removesuffix("-deg")](np.radians(rotation) if form.endswith("-deg") else rotation).as_matrix()
 
 
@@ -307,7 +307,7 @@ _REMEDY = "Give the file that `orthocapture calibrate hand-eye` wrote"
 
 
 def read_hand_eye(path: Path) -> Transform:
-    """T_flange_camera (4, 4), metres, from a hand_eye.json.
+    """Return T_flange_camera (4, 4), metres, from a hand_eye.json.
 
     Raises:
         DataError: the file holds no valid T_flange_camera.
@@ -323,7 +323,7 @@ def read_hand_eye(path: Path) -> Transform:
 
 
 def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
-    """Station by image name, from a CSV with the columns image and station.
+    """Return the station by image name, from a CSV with the columns image and station.
 
     Raises:
         DataError: the columns are missing, or an image has no station.

@@ -95,7 +95,7 @@ class FrameTree:
         edge.poses.append(found.T_parent_child)
 
     def frames(self) -> tuple[str, ...]:
-        """The names of all frames, sorted."""
+        """Return the names of all frames, sorted."""
         return tuple(sorted({*self._edges, *(edge.parent for edge in self._edges.values())}))
 
     def is_static(self, a: str, b: str) -> bool:
@@ -104,7 +104,7 @@ class FrameTree:
         return all(self._edges[child].static for child in (*up, *down))
 
     def pose(self, a: str, b: str, stamp_ns: int, timing: Timing) -> FoundPose:
-        """T_a_b at a time.
+        """Return T_a_b at a time.
 
         Raises:
             DataError: a frame is unknown, or the two are not connected.
@@ -121,7 +121,7 @@ class FrameTree:
         return FoundPose(inverse(T_top[0]) @ T_top[1], away, interpolated)
 
     def _between(self, a: str, b: str) -> tuple[list[str], list[str]]:
-        """The children on the ways from a and from b up to their lowest common frame."""
+        """Return the children on the ways from a and from b up to their lowest common frame."""
         ways = [self._upwards(a), self._upwards(b)]
         while ways[0] and ways[1] and ways[0][-1] == ways[1][-1]:
             ways = [ways[0][:-1], ways[1][:-1]]
@@ -225,7 +225,7 @@ class Recording:
 
 
 def recording_file(path: Path) -> Path:
-    """The MCAP file of a recording, which may be given as the folder of rosbag2.
+    """Return the MCAP file of a recording, which may be given as the folder of rosbag2.
 
     Raises DataError if there is none, or more than one.
     """
@@ -294,7 +294,7 @@ def _take(
 
 
 def _messages(path: Path) -> Iterator[tuple[str, str, bytes]]:
-    """Topic, type and bytes of every message in CDR. Raises one of _DAMAGES, and OSError."""
+    """Yield the topic, type and bytes of every message in CDR. Raises one of _DAMAGES, and OSError."""
     try:
         from mcap.exceptions import McapError  # noqa: PLC0415 - optional
         from mcap.records import Channel, Message, Schema  # noqa: PLC0415
@@ -321,7 +321,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, bytes]]:
 
 
 def _records(path: Path) -> Iterator[Any]:
-    """The records of a file and of its chunks; the sizes that chunks state are checked before they are unpacked."""
+    """Yield records of a file and of its chunks; the sizes that chunks state are checked before they are unpacked."""
     from lz4.frame import get_frame_info  # noqa: PLC0415 - come with mcap
     from mcap.records import Chunk  # noqa: PLC0415
     from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
@@ -362,6 +362,6 @@ class _Bounded:
 
 
 def _plain(error: BaseException) -> str:
-    """The words of an error in one printable line."""
+    """Return the words of an error in one printable line."""
     text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return "".join(c if c.isprintable() else "?" for c in text)[:300]

@@ -139,7 +139,7 @@ def _fitted(
     spheres: ScanSpheres,
     settings: RegistrationSettings,
 ) -> RegistrationResult | None:
-    """The registration; None if the outlines do not determine so much."""
+    """Return the registration; None if the outlines do not determine so much."""
     try:
         return register(outlines, assignments, images, spheres, settings)
     except ComputeError:
@@ -208,7 +208,7 @@ def _errors(
 
 
 def _moved(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, ...]:
-    """(6,) perturbations of T_world_scan, against the cameras, from the one registration to the other.
+    """Return (6,) perturbations of T_world_scan, against the cameras, from the one registration to the other.
 
     Two, if their scales differ: the one holds if the positions are wrong, the other if the list is.
     """
@@ -226,7 +226,7 @@ def _moved(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, .
 
 
 def _light_px(growth: CommonError | None, blur_px: float, common: CommonErrors) -> float:
-    """The bias by light from one side that outlines of this blur and growth may have."""
+    """Return the bias by light from one side that outlines of this blur and growth may have."""
     if blur_px <= _SHARP_PX:
         return common.light_px
     by_growth = 0.0 if growth is None else _LIGHT_OF_GROWTH * abs(growth.value)

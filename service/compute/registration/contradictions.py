@@ -72,7 +72,7 @@ def odd_images(
 
 
 def too_many(odd: Collection[int], images: PosedImages) -> Contradiction | None:
-    """The finding that so many images contradict one another that none can be left out; None if they are few."""
+    """Return finding that so many images contradict one another that none can be left out; None if they are few."""
     n = len(images.poses)
     if len(odd) <= MOST_LEFT_OUT * n:
         return None
@@ -95,7 +95,7 @@ def describe_left_out(
 
 
 def _gaps(registration: RegistrationResult) -> dict[int, float]:
-    """Median distance (px) of each image's outlines from those predicted with its pose as given."""
+    """Return the median distance (px) of each image's outlines from those predicted with its pose as given."""
     by_image: dict[int, list[float]] = {}
     for r in registration.residuals:
         by_image.setdefault(r.image, []).append(r.rms_px)
@@ -113,7 +113,7 @@ def _misses_most(i: int, images: PosedImages, spheres: ScanSpheres, registration
 
 
 def _own_pose(found: Sequence[SphereOutline], images: PosedImages, spheres: ScanSpheres) -> Transform | None:
-    """T_scan_camera by an image's own spheres; None if they do not determine it."""
+    """Return T_scan_camera by an image's own spheres; None if they do not determine it."""
     readings = image_hypotheses(found, spheres.centres_m, spheres.radius_m, images.camera)
     if not readings or rivals(readings):
         return None
@@ -156,7 +156,7 @@ def _finding(
 
 
 def _with_pose(mine: Transform, given: Array, i: int) -> int | None:
-    """The other image whose given pose this is."""
+    """Return the other image whose given pose this is."""
     for k, T in enumerate(given):
         if k == i or not np.isfinite(T).all():
             continue

@@ -14,7 +14,7 @@ Cost = Literal["cone", "sampson", "algebraic"]
 
 
 def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost) -> Array:
-    """Signed residuals (N,) of normalised points (N, 3), z = 1, against spheres at (N, 3) in the camera frame.
+    """Return signed residuals (N,) of normalised points (N, 3), z = 1, against spheres at (N, 3) in the camera frame.
 
     The outline of a sphere is x^T E x = 0 with E^-1 = P Q^-1 P^T. In the camera frame P = [I | 0] and
     Q^-1 ~ [[r^2 I - c c^T, -c], [-c^T, -1]], hence E ~ (|c|^2 - r^2) I - c c^T.
@@ -28,7 +28,7 @@ def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: Poi
 def residuals_and_derivative(
     points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost
 ) -> tuple[Array, Array]:
-    """Residuals (N,) as from `residuals`, and their derivative (N, 3) by the centres."""
+    """Return the residuals (N,) as from `residuals`, and their derivative (N, 3) by the centres."""
     return _value_and_gradient(points, centres_camera_m, radius_m, cost, derivative=True)
 
 

@@ -58,7 +58,7 @@ class RigidMean:
 
 
 def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
-    """The pose T on which most of N independent measurements of it agree, weighted by their covariances.
+    """Return the pose T on which most of N independent measurements of it agree, weighted by their covariances.
 
     It minimises the sum of squared Mahalanobis distances of the poses that agree; the others are excluded. A distance
     is judged against the stated covariances times a common factor, the median distance over its expectation, if that
@@ -97,7 +97,7 @@ def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
 
 
 def _middle(poses: Array, weights: Array) -> int:
-    """The pose from which the median distance to all poses is least."""
+    """Return the pose from which the median distance to all poses is least."""
     return int(np.argmin([np.median(_chi2(_deviations(poses, T), weights)) for T in poses]))
 
 
@@ -115,7 +115,7 @@ def _mean(poses: Array, weights: Array, start: Transform) -> Transform:
 
 
 def _deviations(poses: Array, T: Transform) -> Array:
-    """(N, 6) (d, w) with which T becomes each pose."""
+    """Return (N, 6) (d, w) with which T becomes each pose."""
     turned = Rotation.from_matrix(poses[:, :3, :3] @ T[:3, :3].T).as_rotvec()
     return np.hstack([poses[:, :3, 3] - T[:3, 3], turned])
 
@@ -211,7 +211,7 @@ def sighted_pose(
 
 
 def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
-    """T_scan_camera of a camera that stood still.
+    """Return T_scan_camera of a camera that stood still.
 
     It saw each sphere at the same pixels in every image. What the outlines err there is the same in each, so many
     images are no more certain than one; they show whether the camera was moved.
@@ -222,7 +222,7 @@ def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
 
 
 def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]) -> FurtherPose:
-    """T_first_camera of a camera beside the first one, from the views at which the first one's pose is known.
+    """Return T_first_camera of a camera beside the first one, from the views at which the first one's pose is known.
 
     What both cameras' poses have in common by the spheres is counted twice, which states more than there is.
 

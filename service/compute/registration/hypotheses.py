@@ -43,7 +43,7 @@ class Sightings:
 
 
 def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
-    """The geometry of one image's outlines."""
+    """Return the geometry of one image's outlines."""
     cones = ObservedCones.of(o.cone for o in outlines)
     distance = radius_m / np.sin(cones.half_angles)
     # Half a pixel of the radius covers an outline's systematic error; more if only a part is visible.
@@ -85,7 +85,7 @@ def paired(
     camera: CameraModel,
     gate: MatchGate = ROBOT_GATE,
 ) -> dict[int, int]:
-    """Outline → sphere (M, 3) of the scan frame, matched by predicted directions and sizes."""
+    """Return the outline → sphere (M, 3) of the scan frame, matched by predicted directions and sizes."""
     pairs = match(sightings(outlines, radius_m, camera), apply(T_camera_scan, spheres_m), radius_m, gate)
     return {d: m for d, m, _ in pairs}
 
@@ -230,7 +230,7 @@ _LOOSE = MatchGate(0.4, 0.06)  # of a triple's pose
 def _fitting(
     seen: Sightings, model: NDArray[np.int64], image: NDArray[np.int64], centres: Array, radius_m: float
 ) -> tuple[Array, Array]:
-    """Poses (K, 3, 3), (K, 3) of the triples whose nine parameters fit one pose."""
+    """Return poses (K, 3, 3), (K, 3) of the triples whose nine parameters fit one pose."""
     rotations: list[Array] = []
     places: list[Array] = []
     for start in range(0, len(model), _CHUNK):
@@ -246,7 +246,7 @@ def _fitting(
 def _pose_steps(
     seen: Sightings, pick: NDArray[np.int64], points: Array, rotation: Array, t: Array, radius_m: float, steps: int
 ) -> tuple[Array, Array, Array]:
-    """A number of Gauss–Newton steps for K poses at a time: rotations, translations and chi² (K,).
+    """Return a number of Gauss–Newton steps for K poses at a time: rotations, translations and chi² (K,).
 
     Each pose explains the cones of detections `pick` (K, k) by spheres at `points` (K, k, 3).
     """
@@ -296,7 +296,7 @@ def _damped_steps(J: Array, r: Array) -> Array:
 
 
 def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: float) -> tuple[NDArray[np.int64], Array]:
-    """Number of detections (K,) that each pose explains within loose gates, and their mean angle in radii."""
+    """Return number of detections (K,) that each pose explains within loose gates, and their mean angle in radii."""
     counts = np.zeros(len(R), dtype=np.int64)
     error = np.zeros(len(R))
     for start in range(0, len(R), 2000):

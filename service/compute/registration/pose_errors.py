@@ -63,7 +63,7 @@ def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
 
 
 def _with_calibrated_lens(s: Solution) -> tuple[Array, Array]:
-    """(n, n) covariances of the common unknowns: with the lens as calibrated, and what its errors then cause.
+    """Return (n, n) covariances of the common unknowns: with the lens as calibrated, and what its errors then cause.
 
     An error e of the lens is one of V e of the unknowns, V the regression of their errors on those of the lens.
     """
@@ -125,13 +125,13 @@ def of_inverse(T_a_b: Transform, covariance: Array) -> Array:
 
 
 def of_product(T_a_b: Transform, T_b_c: Transform, covariance_a_b: Array, covariance_b_c: Array) -> Array:
-    """Covariance of T_a_c (6, 6) from those of its two independent factors."""
+    """Return the covariance of T_a_c (6, 6) from those of its two independent factors."""
     by_a_b, by_b_c = product_jacobians(T_a_b, T_b_c)
     return by_a_b @ covariance_a_b @ by_a_b.T + by_b_c @ covariance_b_c @ by_b_c.T
 
 
 def product_jacobians(T_a_b: Transform, T_b_c: Transform) -> tuple[Array, Array]:
-    """Derivatives (6, 6) of T_a_c by T_a_b and by T_b_c."""
+    """Return the derivatives (6, 6) of T_a_c by T_a_b and by T_b_c."""
     R = T_a_b[:3, :3]
     moved, turned = np.eye(6), np.zeros((6, 6))
     moved[:3, 3:] = -skew(R @ T_b_c[:3, 3])

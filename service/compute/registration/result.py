@@ -48,7 +48,7 @@ class Solution:
     outline_factor: float
 
     def by_own_light(self) -> Array:
-        """(n, n) what light of their own on single spheres adds to the covariance of the common unknowns.
+        """Return (n, n) what light of their own on single spheres adds to the covariance of the common unknowns.
 
         The adjustment knows nothing of it: with C the covariance and P the information on the spheres' centres, a
         displacement e of the centres moves the unknowns by C P e.
@@ -110,7 +110,7 @@ class RegistrationResult:
         return np.sum(list(self.refined_components().values()), axis=0)
 
     def refined_components(self) -> dict[str, Array]:
-        """Parts of `refined_covariance`; the noise of outlines and poses is inseparable and one part."""
+        """Return the parts of `refined_covariance`; the noise of outlines and poses is inseparable and one part."""
         s = self.solution
         problem = s.problem
         by_common, own = self.refined_gain()
@@ -156,11 +156,11 @@ class RegistrationResult:
         return float(self.sigma_map_m(np.asarray(point_scan_m)[None])[0])
 
     def covariance_at_m2(self, point_scan_m: Array) -> Array:
-        """(3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
+        """Return (3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
         return self._at_m2(self.covariance, point_scan_m)
 
     def part_at_m2(self, component: str, point_scan_m: Array) -> Array:
-        """(3, 3) the part of `covariance_at_m2` that a component causes."""
+        """Return (3, 3) the part of `covariance_at_m2` that a component causes."""
         return self._at_m2(self.components[component], point_scan_m)
 
     def _at_m2(self, covariance: Array, point_scan_m: Array) -> Array:
@@ -206,7 +206,7 @@ def held_out_rows(
     members: list[tuple[int, int, int]],
     centres_scan_m: Array,
 ) -> HeldOutRows:
-    """Rows of outlines of other spheres, (C, 3) in the scan frame; members are (image, outline, sphere)."""
+    """Return rows of outlines of other spheres, (C, 3) in the scan frame; members are (image, outline, sphere)."""
     own = solution.problem
     problem = replace(with_outlines(own, outlines, members), centres=np.asarray(centres_scan_m), sphere_prior=None)
     state = replace(solution.state, spheres=np.zeros_like(problem.centres))

@@ -168,7 +168,7 @@ def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) 
 
 
 def _gain(here: _Iterate, there: _Iterate) -> float:
-    """Decrease of the objective; growth by rounding alone does not count."""
+    """Return the decrease of the objective; growth by rounding alone does not count."""
     return here.objective * (1 + 1e-9) + 1e-9 - there.objective
 
 
@@ -233,7 +233,7 @@ def _robust_weights(
 
 
 def _distances(problem: Problem, here: _Iterate, weighting: _Weighting) -> tuple[Array, Array]:
-    """Norm of each outline's residual (O,), in its standard deviations and in px, with pose errors removed."""
+    """Return norm of each outline's residual (O,), in its standard deviations and in px, with pose errors removed."""
     blocks = _blocks(problem, here.rows, weighting.outlines)
     m = marginalise(blocks, weighting.pose_root, weighting.factor)
     xi = pose_errors(blocks, m, np.zeros(problem.size), weighting.factor)
@@ -242,7 +242,7 @@ def _distances(problem: Problem, here: _Iterate, weighting: _Weighting) -> tuple
 
 
 def rms_px(problem: Problem, whitened: Array) -> Array:
-    """RMS (O,) in px, over an outline, of its cone's displacement, given as whitened rows (O, 3)."""
+    """Return the RMS (O,) in px, over an outline, of its cone's displacement, given as whitened rows (O, 3)."""
     r = np.linalg.solve(problem.whiten, whitened[:, :, None])[:, :, 0]
     # Angles are stretched in the image plane by 1 / cos^2 in the radial direction and by 1 / cos across it.
     stretch = problem.focal_px / problem.cones.axes[:, 2] ** 1.5
@@ -293,7 +293,7 @@ def _residuals(s: Solution, given_px: Array) -> tuple[OutlineResidual, ...]:
 
 
 def _cameras_in_scan(s: Solution, stations: NDArray[np.int64], *, refined: bool) -> Array:
-    """T_scan_camera (N, 4, 4), each through the base of its station; NaN for stations without outlines."""
+    """Return T_scan_camera (N, 4, 4), each through the base of its station; NaN for stations without outlines."""
     T = s.state.cameras(s.problem, refined=refined)
     position = {g: k for k, g in enumerate(s.problem.groups)}
     return np.array(
@@ -396,12 +396,12 @@ class PoseNoise:
     free: bool
 
     def root(self, factors: Array) -> Array:
-        """(N, 6, 6) such that root @ root.T is the covariance."""
+        """Return (N, 6, 6) such that root @ root.T is the covariance."""
         return np.einsum("k,knij->nij", factors, self.parts)
 
 
 def no_pose_noise(n_images: int) -> PoseNoise:
-    """No pose errors: poses taken as exact."""
+    """Return no pose errors: poses are taken as exact."""
     return PoseNoise(np.zeros((1, n_images, 6, 6)), 1.0, free=False)
 
 
@@ -419,7 +419,7 @@ def unknown_pose_noise(n_images: int) -> PoseNoise:
 
 
 def given_pose_noise(covariance: Array) -> PoseNoise:
-    """The stated covariances (N, 6, 6); the residuals can increase them, never decrease them."""
+    """Return the stated covariances (N, 6, 6); the residuals can increase them, never decrease them."""
     values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return PoseNoise(root[None], 1.0, free=True)

@@ -16,7 +16,7 @@ HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1 with its centre at 0.5; ours
 
 
 def to_colmap_camera(camera: CameraModel) -> pycolmap.Camera:
-    """COLMAP's camera for our calibrated one: OPENCV, or FULL_OPENCV if it has more than k1, k2, p1, p2."""
+    """Return COLMAP's camera for our calibrated one: OPENCV, or FULL_OPENCV if it has more than k1, k2, p1, p2."""
     more = [camera.k3, camera.k4, camera.k5, camera.k6]
     return pycolmap.Camera(
         camera_id=1,
@@ -65,24 +65,24 @@ def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
 
 
 def to_colmap_pose(T_world_camera: Transform) -> pycolmap.Rigid3d:
-    """COLMAP's cam_from_world for our T_world_camera (4, 4)."""
+    """Return COLMAP's cam_from_world for our T_world_camera (4, 4)."""
     T_camera_world = inverse(T_world_camera)
     return pycolmap.Rigid3d(pycolmap.Rotation3d(T_camera_world[:3, :3]), T_camera_world[:3, 3])
 
 
 def from_colmap_pose(cam_from_world: pycolmap.Rigid3d) -> Transform:
-    """T_world_camera (4, 4) from COLMAP's cam_from_world."""
+    """Return T_world_camera (4, 4) from COLMAP's cam_from_world."""
     rotation = np.asarray(cam_from_world.rotation.matrix(), dtype=np.float64)
     return inverse(transform(rotation, np.asarray(cam_from_world.translation, dtype=np.float64)))
 
 
 def from_colmap_pixels(points: Array) -> Array:
-    """Our pixels (N, 2) from COLMAP's image coordinates (N, 2)."""
+    """Return our pixels (N, 2) from COLMAP's image coordinates (N, 2)."""
     return points - HALF_PIXEL
 
 
 def to_colmap_pixels(pixels: Array) -> Array:
-    """COLMAP's image coordinates (N, 2) from our pixels (N, 2)."""
+    """Return COLMAP's image coordinates (N, 2) from our pixels (N, 2)."""
     return pixels + HALF_PIXEL
 
 

@@ -74,7 +74,7 @@ class SfmModel:
         return similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera, known)
 
     def pose_covariance(self, known: CameraCovariance | None = None) -> Array:
-        """(N, 6, 6) covariance of each pose alone, as in `joint_pose_covariance`."""
+        """Return (N, 6, 6) covariance of each pose alone, as in `joint_pose_covariance`."""
         return blocks(self.joint_pose_covariance(known))
 
 
@@ -319,7 +319,7 @@ def similarity_covariance(
 def _pulls(
     state: BundleState, data: AdjustmentData, tracks: Rows, bread: Array, known: CameraCovariance
 ) -> Iterator[Array]:
-    """(6 N,) change of the poses' gradient for each deviation of the camera, with the points adjusted."""
+    """Yield (6 N,) change of the poses' gradient for each deviation of the camera, with the points adjusted."""
     plain = linearise(state, data, Sigmas())["tracks"]
     # The square roots of the robust weights, over the sigma that they were found with.
     root = np.sqrt(_row_squares(tracks) / np.maximum(_row_squares(plain), 1e-300))
@@ -335,7 +335,7 @@ def _row_squares(rows: Rows) -> Array:
 
 
 def blocks(covariance: Array) -> Array:
-    """(N, 6, 6) covariance of each pose, from a joint covariance (6 N, 6 N)."""
+    """Return (N, 6, 6) covariance of each pose, from a joint covariance (6 N, 6 N)."""
     n = len(covariance) // 6
     return np.array([covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
 

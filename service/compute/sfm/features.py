@@ -44,7 +44,7 @@ class ImageFeatures:
     descriptors: NDArray[np.uint8] = field(repr=False)
 
     def to_bytes(self) -> bytes:
-        """A NumPy archive (.npz, about 0.1 kB a feature); the same features give the same bytes."""
+        """Return a NumPy archive (.npz, about 0.1 kB a feature); the same features give the same bytes."""
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
@@ -95,7 +95,7 @@ class PairMatches:
 
 
 def pack_matches(matches: Sequence[PairMatches]) -> bytes:
-    """Matches of any number of pairs as a NumPy archive (.npz), sorted by pair, whatever the given order."""
+    """Return matches of any number of pairs as a NumPy archive (.npz), sorted by pair, whatever the given order."""
     ordered = sorted(matches, key=lambda m: m.pair)
     buffer = io.BytesIO()
     np.savez_compressed(

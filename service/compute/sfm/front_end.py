@@ -86,7 +86,7 @@ class FrontEnd:
             child.close()
 
     def extract_features(self, file: Path) -> ImageFeatures:
-        """Features of one image.
+        """Return the features of one image.
 
         Raises:
             DataError: the image is missing, unreadable or of another size than the camera.
@@ -95,7 +95,7 @@ class FrontEnd:
         return self._extracted(self._children[0], file)
 
     def extract_all(self, files: Mapping[str, Path], progress: Progress | None = None) -> dict[str, ImageFeatures]:
-        """Features of several images by name, in parallel; `progress` is called with ("extract", done, total).
+        """Return features of several images by name, in parallel; `progress` is called with ("extract", done, total).
 
         Raises:
             DataError, ComputeError: as `extract_features`; the message names the image.
@@ -150,7 +150,7 @@ class FrontEnd:
         stage: str,
         progress: Progress | None,
     ) -> list[Answer]:
-        """Answers in the order of the items, computed by the children in parallel."""
+        """Return the answers in the order of the items, computed by the children in parallel."""
         free: SimpleQueue[ColmapProcess] = SimpleQueue()
         for child in self._children:
             free.put(child)
@@ -178,7 +178,7 @@ class FrontEnd:
 
 
 def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:
-    """The pairs that have not been matched yet."""
+    """Return the pairs that have not been matched yet."""
     done = {m.pair for m in matches}
     return sorted({(min(pair), max(pair)) for pair in pairs} - done)
 
@@ -225,7 +225,7 @@ class CachedFrontEnd:
         front: FrontEnd,
         progress: Progress | None,
     ) -> list[PairMatches]:
-        """Matches of exactly these pairs; those in the workspace are used if the features are the same."""
+        """Return the matches of exactly these pairs; those in the workspace are used if the features are the same."""
         kept = self.workspace / "matches.npz"
         stamp = self.workspace / "matches.json"
         recipe = json.dumps(

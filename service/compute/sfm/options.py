@@ -58,7 +58,7 @@ Effort = Literal["quick", "normal", "quality"]
 
 
 def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothing", threads: int = 2) -> SfmOptions:
-    """Settings for images of this camera.
+    """Return the settings for images of this camera.
 
     Camera positions were off by 0.017–0.028 mm (normal) and 0.013 mm (quality) on 20 rendered images 1920 px wide of
     a scene 0.65 m away (bench/poses/sfm.py); the errors are noise, so more features reduce them.
@@ -83,7 +83,7 @@ def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothin
 
 
 def reduction(max_image_size: int, width: int, height: int) -> float:
-    """Image pixels per pixel at which features are extracted."""
+    """Return the image pixels per pixel at which features are extracted."""
     return max(1.0, max(width, height) / max_image_size) if max_image_size else 1.0
 
 
@@ -152,7 +152,7 @@ def pairs_of(
 
 
 def _angles_deg(rays: Array, others: Array) -> Array:
-    """(K, L) angles between unit vectors (K, 3) and (L, 3)."""
+    """Return (K, L) angles between unit vectors (K, 3) and (L, 3)."""
     return np.degrees(np.arccos(np.clip(rays @ others.T, -1, 1)))
 
 
@@ -178,7 +178,7 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
 
 
 def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int) -> set[tuple[int, int]]:
-    """The nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
+    """Return the nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
     parts = _Parts(n)
     for i, j in chosen:
         parts.join(i, j)
@@ -210,7 +210,7 @@ class _Parts:
         self._towards = list(range(nodes))
 
     def of(self, node: int) -> int:
-        """The node that stands for the part to which this one belongs."""
+        """Return the node that stands for the part to which this one belongs."""
         towards = self._towards
         while towards[node] != node:
             towards[node] = node = towards[towards[node]]

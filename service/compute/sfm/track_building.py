@@ -122,7 +122,7 @@ def _of_pairs(
 
 
 def triangulate(poses: Array, plane: Array, sightings: TrackedFeatures, sigma: float) -> tuple[Array, Array]:
-    """Scene points (P, 3) by robust triangulation from known poses, and the error of each observation.
+    """Return the scene points (P, 3) by robust triangulation from known poses, and the error of each observation.
 
     First the point nearest to all rays, then Gauss–Newton steps on the reprojection errors; both use Cauchy weights,
     which favour the position on which most observations of a track agree.
@@ -177,7 +177,7 @@ def reprojection(poses: Array, points: Array, plane: Array, sightings: TrackedFe
 
 
 def wide_enough(poses: Array, points: Array, sightings: TrackedFeatures) -> NDArray[np.bool_]:
-    """(P,) whether the angle between the rays to a point is large enough."""
+    """Return (P,) whether the angle between the rays to a point is large enough."""
     ray = points[sightings.track] - poses[sightings.image, :3, 3]
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     mean = _summed(ray, sightings)
@@ -189,14 +189,14 @@ def wide_enough(poses: Array, points: Array, sightings: TrackedFeatures) -> NDAr
 
 
 def _summed(values: Array, sightings: TrackedFeatures) -> Array:
-    """Sums of (O, …) over the observations of each track."""
+    """Return the sums of (O, …) over the observations of each track."""
     flat = values.reshape(len(values), -1)
     sums = [np.bincount(sightings.track, flat[:, k], minlength=sightings.count) for k in range(flat.shape[1])]
     return np.array(sums, dtype=np.float64).T.reshape(sightings.count, *values.shape[1:])
 
 
 def _solved(A: Array, b: Array) -> Array:
-    """Solutions x (P, 3) of A x = b with slight damping, so that a point without parallax stays finite."""
+    """Return the solutions x (P, 3) of A x = b with slight damping, so that a point without parallax stays finite."""
     trace = np.trace(A, axis1=1, axis2=2)
     damped: Array = A + (1e-9 * trace + 1e-300)[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(damped, b[:, :, None])[:, :, 0], dtype=np.float64)

@@ -73,7 +73,7 @@ def fused(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Field:
 
 
 def _blocks(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Ints:
-    """(B, 3) blocks within the truncation of points of enough maps."""
+    """Return (B, 3) blocks within the truncation of points of enough maps."""
     edge = SIDE * voxel_m
     reach = TRUNCATION * voxel_m
     found: list[Ints] = []
@@ -145,7 +145,7 @@ def _pixels(one: DepthMap, points: Array) -> tuple[Array, Array]:
 
 
 def _sampled(depth: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (N,) between pixels; NaN where one of the four around is unknown."""
+    """Return the depth (N,) between pixels; NaN where one of the four around is unknown."""
     columns = min(len(u), _MOST_COLUMNS)
     rows = -(-len(u) // columns)
     places = np.full((2, rows * columns), -10.0, dtype=np.float32)
@@ -162,7 +162,7 @@ _ROUND = 1e-3  # voxels: vertices of neighbouring tiles closer than this are one
 
 
 def surface_of(found: Field, least_maps: int) -> Surface:
-    """The surface where the distance is zero, in metres, faces outward.
+    """Return the surface where the distance is zero, in metres, faces outward.
 
     Args:
         found: the field.
@@ -207,7 +207,7 @@ def _whole_cells(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _tile(
     found: Field, order: dict[tuple[int, ...], int], first: Ints, least_maps: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Distances and known voxels of a tile, with one layer of its neighbours."""
+    """Return the distances and known voxels of a tile, with one layer of its neighbours."""
     edge = SIDE * _TILE + 1
     distance = np.full((edge + SIDE,) * 3, 1.0, dtype=np.float32)
     known = np.zeros(distance.shape, dtype=np.bool_)

@@ -48,7 +48,7 @@ class ConstellationMatch:
 
 
 def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> ConstellationMatch:
-    """Rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, in any order.
+    """Return the rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, in any order.
 
     Triangles with equal sides propose poses; the pose that brings most spheres within `tolerance_m` wins. Spheres
     missing from either set are reported. Handedness is checked, so that a mirrored copy (an axis negated by a DICOM
@@ -123,7 +123,7 @@ def _count(solutions: list[Pairs]) -> int:
 
 
 def _best(a: Array, b: Array, tolerance: float) -> list[Pairs]:
-    """The largest consistent assignment of at least four, and all different ones of the same size."""
+    """Return the largest consistent assignment of at least four, and all different ones of the same size."""
     found: dict[Pairs, float] = {}
     size = _LEAST
     for ta, tb in _triangles(a, b, tolerance):
@@ -154,7 +154,7 @@ def _assign(a: Array, b_in_a: Array, tolerance: float) -> tuple[Pairs, float]:
 
 
 def _triangles(a: Array, b: Array, tolerance: float) -> list[tuple[list[int], list[int]]]:
-    """Index triples of a and b with three equal sides; triples of a are taken in one order only."""
+    """Return index triples of a and b with three equal sides; triples of a are taken in one order only."""
     da = np.linalg.norm(a[:, None] - a[None], axis=2)
     db = np.linalg.norm(b[:, None] - b[None], axis=2)
     out: list[tuple[list[int], list[int]]] = []
@@ -262,7 +262,7 @@ def _next(
 
 
 def _mean(sphere: dict[int, int], parts_m: Sequence[Array], poses: dict[int, Transform]) -> Array:
-    """Mean position (3,) of a sphere over the parts that show it, in the frame of the first."""
+    """Return the mean position (3,) of a sphere over the parts that show it, in the frame of the first."""
     return np.mean([apply(poses[part], parts_m[part][index]) for part, index in sphere.items()], axis=0)
 
 

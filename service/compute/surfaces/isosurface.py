@@ -65,7 +65,7 @@ def surface(
 
 
 def _range(volume_hu: NDArray[np.int16], depth: int) -> tuple[int, int]:
-    """The least and the largest value; of a mapped file, only `depth` slices are in memory at a time."""
+    """Return the least and the largest value; of a mapped file, only `depth` slices are in memory at a time."""
     lows: list[int] = []
     highs: list[int] = []
     for first in range(0, len(volume_hu), depth):
@@ -131,7 +131,7 @@ _INNER, _SHELL = 0.8, (1.2, 1.5)  # of the radius
 
 
 def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Array, NDArray[np.int32]]:
-    """Triangles around the segmented voxels.
+    """Return the triangles around the segmented voxels.
 
     The surface is where the segmentation, smoothed by a Gaussian of SIGMA_VOXELS, has the value ½. That moves a
     curved surface inwards by σ² H (H: its mean curvature): 0.005 mm for a sphere of 15 mm in voxels of 0.4 mm. What
@@ -200,7 +200,7 @@ def sphere_contrasts(
 
 
 def cut_voxels(ends: NDArray[np.bool_], T_ct_voxel: Transform, centres_m: Array) -> int:
-    """Number of voxels of the object between the spheres that the first and the last slice cut.
+    """Return the number of voxels of the object between the spheres that the first and the last slice cut.
 
     Only what stands between the spheres counts, as seen along the slices' line: in the rectangle of rows and columns
     around their centres. The scanner's table, below it, goes on beyond any series.

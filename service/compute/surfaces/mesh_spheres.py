@@ -166,7 +166,7 @@ def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | Non
 def _fits(
     starts: Array, vertices: Array, faces: IntArray, patches: Surfels, tree: cKDTree, radius: float
 ) -> list[SphereFit]:
-    """The final fit from each coarse centre (K, 3), without those that fail."""
+    """Return the final fit from each coarse centre (K, 3), without those that fail."""
     if len(starts) == 0:
         return []
     points, weight = _surroundings(starts, vertices, faces, radius)
@@ -192,7 +192,7 @@ def _fits(
 
 
 def _surroundings(starts: Array, vertices: Array, faces: IntArray, radius: float) -> tuple[Array, Array]:
-    """Vertices (N, 3) near any of the centres, and the area each represents; one pass for all centres."""
+    """Return the vertices (N, 3) near any of the centres, and the area each represents; one pass for all centres."""
     low, high = starts.min(axis=0) - 2 * radius, starts.max(axis=0) + 2 * radius
     cell = max(0.5 * radius, float(np.max(high - low)) / 300)
     size = np.ceil((high - low) / cell).astype(np.int64) + 1
@@ -244,7 +244,7 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
 
 
 def _cap_deg(fit: SphereFit) -> float:
-    """Opening in degrees of a cap with the same scatter as the inlier surface in its narrow direction."""
+    """Return the opening in degrees of a cap with the same scatter as the inlier surface in its narrow direction."""
     unit, weight = fit.patches.unit, fit.patches.weight / fit.patches.weight.sum()
     middle = weight @ unit
     off = unit - middle
@@ -266,7 +266,7 @@ def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereL
 def _judge(
     fits: list[SphereFit], radius: float, limits: SphereLimits, expected: int | None
 ) -> tuple[list[SphereFit], list[_Candidate], tuple[CentreUncertainty, ...]]:
-    """Accepted fits with their uncertainties, and the near misses, best covered first."""
+    """Return the accepted fits with their uncertainties, and the near misses, best covered first."""
     ranked = sorted(fits, key=lambda f: -f.coverage)
     refused: list[_Candidate] = []
     good: list[SphereFit] = []
@@ -365,7 +365,7 @@ def _at_seeds(
     radius: float,
     limits: SphereLimits,
 ) -> tuple[MeshSphere, ...]:
-    """The sphere at each seed, in the seeds' order."""
+    """Return the sphere at each seed, in the seeds' order."""
     if seeds.ndim != 2 or seeds.shape[1] != 3 or not np.isfinite(seeds).all():
         raise DataError(f"seeds {seeds.shape} are not points (K, 3)", remedy="Give x, y, z of a point at each sphere")
     peaks = vote_peaks(patches, radius)

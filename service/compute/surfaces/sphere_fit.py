@@ -94,7 +94,7 @@ def _from_sums(cells: Array, low: Array, cell: float, *, is_mesh: bool) -> Surfe
 
 
 def summed(group: IntArray, columns: list[Array], n: int) -> Array:
-    """Sums (n, len(columns)) of the columns (N,) over the rows of each group (N,)."""
+    """Return the sums (n, len(columns)) of the columns (N,) over the rows of each group (N,)."""
     return np.stack([np.bincount(group, column, n).astype(np.float64) for column in columns], axis=1)
 
 
@@ -169,7 +169,7 @@ class CentreFit:
 
 
 def tukey_weights(residual: Array, half_width: float | Array) -> Array:
-    """Tukey's weights (N,) of residuals (N,) that lie in a band of this half-width (N,)."""
+    """Return Tukey's weights (N,) of residuals (N,) that lie in a band of this half-width (N,)."""
     return (1 - (residual / half_width) ** 2) ** 2
 
 
@@ -306,7 +306,7 @@ class SphereFit:
 
 
 def fit_sphere(samples: SphereSamples, start: Array, radius: float, band: float) -> SphereFit | None:
-    """Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
+    """Return Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
     points, area = samples.points, samples.weight
 
     def narrowed(at: TukeyStep, half_width: float) -> float | None:
@@ -409,7 +409,7 @@ def coverage(u: Array) -> float:
 
 
 def sample_weights(points: Array, cell: float) -> Array:
-    """Weights (N,) of points without faces: a cell of surface counts once, however many points are in it."""
+    """Return weights (N,) of points without faces: a cell of surface counts once, however many points are in it."""
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     key = (index[:, 0] * (1 << 20) + index[:, 1]) * (1 << 20) + index[:, 2]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)

@@ -53,7 +53,7 @@ class Matcher:
 
 
 def matchers() -> dict[str, Matcher]:
-    """Every method by its name.
+    """Return every method by its name.
 
     Raises:
         ConfigurationError: two have the same name, or an entry point names something else.
@@ -62,7 +62,7 @@ def matchers() -> dict[str, Matcher]:
 
 
 def matcher(name: str) -> Matcher:
-    """The method of this name.
+    """Return the method of this name.
 
     Raises:
         ConfigurationError: there is none.

@@ -24,7 +24,7 @@ class ExtractedSift:
         self._known: dict[bytes, SiftFeatures] = {}
 
     def of(self, picture: Picture) -> SiftFeatures:
-        """The features of a picture, extracted once."""
+        """Return the features of a picture, extracted once."""
         key = hashlib.blake2b(picture.tobytes()).digest()
         if key not in self._known:
             grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
