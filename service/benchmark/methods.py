@@ -150,7 +150,7 @@ class _UnitBox(BaseModel):
 
 
 def from_unit_box(vertices: Array, data: Path) -> Array:
-    """World points (N, 3), in metres, of a mesh that was made from an export with `unit_box.json` in its folder.
+    """Return world points (N, 3), in metres, of a mesh made from an export with `unit_box.json` in its folder.
 
     Raises:
         DataError: the file is not what the export wrote.
@@ -166,7 +166,7 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
 
 
 def triangulation(place: Workplace, dense: Path) -> Command:
-    """Return command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
+    """Return our command that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
     return (place.python, "-m", "service.benchmark.programs.colmap", "triangulate", str(place.data), str(dense))
 
 

@@ -141,7 +141,7 @@ def dh_joints(arm: ArmModel) -> NDArray[np.int64]:
 
 
 def correction_design(arm: ArmModel, joints_rad: Array, about: ArmCorrection) -> Array:
-    """(N, 6, `dh_count` + `gear_count`) derivative of the flange's pose by all parameters, in units of tolerances.
+    """Return (N, 6, `dh_count` + `gear_count`) derivative of the flange's pose by all parameters, in tolerances.
 
     Columns: DH deltas joint by joint (a, d, α, θ), β of those that have it, then for each joint cos(k q), then
     sin(k q), k = 1 … `harmonics`. It is taken for the arm with the errors `about`: twists of half a degree are so
@@ -172,7 +172,7 @@ def _dh_tolerances(arm: ArmModel) -> Array:
 
 
 def correction_of(arm: ArmModel, scaled: Array, observed: Array) -> ArmCorrection:
-    """The correction from scaled parameters in the order of `correction_design`, those of the gears or without."""
+    """Return the correction from scaled parameters in the order of `correction_design`, with or without the gears."""
     count, of = dh_count(arm), arm.tolerances
     waves = np.zeros(gear_count(arm))
     waves[: len(scaled) - count] = scaled[count:]

@@ -39,7 +39,7 @@ def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0
 
 
 def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transform] | None:
-    """Return arm and its tool T_flange_tool whose poses these are; None if no known arm with one fixed tool has them.
+    """Find the arm and its tool T_flange_tool with these poses; None if no known arm with one fixed tool has them.
 
     Args:
         joints_rad: (N, J).
@@ -57,7 +57,7 @@ def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transf
 
 
 def chain(values: Array) -> Array:
-    """(N, J + 1, 4, 4) T_base_0 … T_base_J from values (N, J, 4 or 5) in the order a, d, α, θ and, if given, β.
+    """Return (N, J + 1, 4, 4) T_base_0 … T_base_J from values (N, J, 4 or 5) in the order a, d, α, θ and any β.
 
     T_(i-1)_i = Rz(θ) Tz(d) Tx(a) Ry(β) Rx(α).
     """
@@ -135,7 +135,7 @@ def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:
 
 
 def solve_joints(arm: ArmModel, T_base_flange: Transform, starts_rad: Array) -> Array | None:
-    """Joints (J,) that reach a pose, by damped Newton steps from each start (S, J) in turn; None if none converges.
+    """Find joints (J,) that reach a pose, by damped Newton steps from each start (S, J) in turn; None if none does.
 
     The result is within the limits. For planning only: whether the arm reaches the pose in a posture near the starts.
     Every step is taken with the same damping, since on a long way round the error may grow for a while.

@@ -124,7 +124,7 @@ def _read(
 
 
 def _rough_pose(outlines: Sequence[SphereOutline], spheres_m: Array, radius_m: float) -> Transform | None:
-    """T_camera_scene by matching the spheres' positions in this image alone with those from other photographs."""
+    """Find T_camera_scene by matching the spheres' positions in this image with those from other photographs."""
     places = places_by_size([outline.cone for outline in outlines], radius_m)
     if len(places) < _LEAST_SPHERES:
         return None
@@ -141,7 +141,7 @@ def pose_by_spheres(
     spheres_m: Array,
     radius_m: float,
 ) -> tuple[Transform | None, dict[int, int]]:
-    """T_camera_scene of one image and outline → sphere; None and {} if fewer than four spheres (M, 3) agree."""
+    """Find T_camera_scene of an image and outline → sphere; None and {} if fewer than four spheres (M, 3) agree."""
     if start is None:
         return None, {}
     markers = paired(outlines, start, spheres_m, radius_m, camera)

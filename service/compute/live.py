@@ -60,7 +60,7 @@ class ProvisionalRegistration:
     used: tuple[str, ...]  # images with spheres assigned, in the order of the registration
 
     def predicted_error_m(self, point_scan_m: Array) -> float:
-        """Predicted standard deviation (3D, metres) with which this station's images place a scan point (3,)."""
+        """Predict the standard deviation (3D, metres) with which this station's images place a scan point (3,)."""
         return self.registration.sigma_at_m(point_scan_m)
 
 
@@ -144,7 +144,7 @@ def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], c
 
 
 def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
-    """Share of the pixels of an image (H, W, 3) with a clipped channel, estimated from every sixteenth pixel."""
+    """Return the share of pixels of an image (H, W, 3) with a clipped channel, from every sixteenth pixel."""
     return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
 
 

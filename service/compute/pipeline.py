@@ -309,7 +309,7 @@ def draw_overlay(
     control_centres_m: Array | None = None,
     radius_m: float = 0.015,
 ) -> NDArray[np.uint8]:
-    """A copy (H, W, 3) with detected outlines (green: registration, blue: control, grey: unused, red: excluded),
+    """Draw a copy (H, W, 3) with detected outlines (green: registration, blue: control, grey: unused, red: excluded),
     their sphere numbers, and the outlines that the registration predicts, dashed in yellow.
     """
     picture = image_bgr.copy()

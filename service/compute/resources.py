@@ -45,7 +45,7 @@ def machine_memory(root: Path = Path("/")) -> MachineMemory:
 
 
 def processes_for(items: int, each_mb: float, memory: MachineMemory | None = None) -> int:
-    """Return number of processes that share this work: one a core, as long as they fit into half of the memory."""
+    """Return the number of processes that share this work: one a core, as long as they fit into half the memory."""
     fit = int(0.5 * (memory or machine_memory()).total_mb / each_mb)
     return max(1, min(items, os.cpu_count() or 1, fit))
 

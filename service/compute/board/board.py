@@ -243,7 +243,7 @@ def _grid_spacing(grid: Array) -> float:
 
 
 def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return refined corners (N, 2), and which of them stayed near their start with their whole window in the image.
+    """Refine corners (N, 2); return also which stayed near their start with their whole window in the image.
 
     A corner is the point whose directions to all pixels of the window are normal to the gradients there. Four squares
     meet with point symmetry, so neither gamma nor blur moves this point. Smoothing first halves the error:

@@ -138,7 +138,7 @@ def _grid(known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Arra
 
 
 def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _ToleranceDraws) -> Array:
-    """Each pose shifted in its image plane until the board touches the wanted side of the frame, or is centred."""
+    """Shift each pose in its image plane until the board touches the wanted side of the frame, or is centred."""
     size, margin = np.array([camera.width, camera.height]), _MARGIN * camera.width
     poses = poses.copy()
     for _ in range(_ROUNDS):
@@ -349,7 +349,7 @@ class _InformationGain:
         return lens, mount
 
     def start(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """Information (8, 8) and (12, 12) from images that count already, plus the prior from the nominal values."""
+        """Sum the information (8, 8) and (12, 12) of images that count already and the prior of nominal values."""
         lens, mount = self.gains(T_base_camera)
         weak = np.diag(1 / np.array([*[0.01] * 3, *[0.05] * 3, *[0.05] * 3, *[0.2] * 3]) ** 2)
         return self.prior + lens.sum(axis=0), weak + mount.sum(axis=0)

@@ -58,7 +58,7 @@ def diagnose(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
-    """Return mistake in the board's description that explains two of these images; None if any image shows the board.
+    """Find the mistake in the board's description that explains two images; None if any image shows the board.
 
     A single image may just show a partly covered board, so one is enough only if there is no other.
     """

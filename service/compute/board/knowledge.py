@@ -220,7 +220,7 @@ def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tu
 
 
 def _nearer_end(T_base_board: Transform, seen: Transform, board: Board) -> Transform:
-    """The nominal pose, or that of the board rotated by half a turn, whichever is nearer to the observed one."""
+    """Return the nominal pose, or that of the board turned by half a turn, whichever is nearer the observed one."""
     middle = board.points().mean(axis=0)
     other = T_base_board @ transform(Rotation.from_euler("z", np.pi), 2 * middle * [1, 1, 0])
     return min((T_base_board, other), key=lambda T: float(np.linalg.norm(T[:3, :3] - seen[:3, :3])))
@@ -251,7 +251,7 @@ def lens_prior(camera: CameraModel) -> Array:
 
 
 def lens_information(boards: Array, camera: CameraModel, board: Board, corner_sigma_px: float) -> Array:
-    """(C, 8, 8) information about fx … p2 from images of boards T_camera_board (C, 4, 4) whose poses are unknown."""
+    """Return (C, 8, 8) information about fx … p2 from boards T_camera_board (C, 4, 4) of unknown pose."""
     some = (
         np.arange(board.columns * board.rows, dtype=np.int64)
         .reshape(board.rows, board.columns)[::_EVERY, ::_EVERY]
@@ -262,7 +262,7 @@ def lens_information(boards: Array, camera: CameraModel, board: Board, corner_si
 
 
 def lens_field(camera: CameraModel) -> Array:
-    """(8, 8) matrix F such that trace(F C) is the mean variance, px², of projected points, less a camera motion.
+    """Return (8, 8) F such that trace(F C) is the mean variance, px², of projected points, less a camera motion.
 
     C is the covariance of fx … p2. Whatever a rigid motion of the camera can absorb is not a calibration error.
     """
@@ -294,7 +294,7 @@ def hand_eye_information(T_base_camera: Array, known: BoardKnowledge, board: Boa
 
 
 def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigma_px: float) -> float:
-    """Predicted `projection_uncertainty` of a calibration from boards T_camera_board (N, 4, 4), worst in the image.
+    """Predict the `projection_uncertainty`, worst in the image, of a calibration from T_camera_board (N, 4, 4).
 
     At the boards' median distance; NaN if they do not determine the camera.
     """

@@ -198,7 +198,7 @@ def draw_board_plan(
     points_m: Array,
     camera: CameraModel,
 ) -> bytes:
-    """PNG: cameras as pyramids around the board; taken ones grey, suggested ones in colour with their numbers."""
+    """Draw a PNG of cameras as pyramids around the board; taken ones grey, suggested ones numbered in colour."""
     middle = points_m.mean(axis=0)
     lift = T_base_board.copy()
     lift[:3, 3] = apply(T_base_board, middle)

@@ -92,7 +92,7 @@ def find_boards(
 
 
 def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:
-    """A mistake in the board's description, from a few of the images; None if it is found or nothing explains it."""
+    """Look for a mistake in the board's description in a few images; None if it is found or nothing explains it."""
     some = [files[k] for k in sorted({round(k * (len(files) - 1) / (_PROBED - 1)) for k in range(_PROBED)})]
     greys: list[Grey] = []
     for file in some:

@@ -414,7 +414,7 @@ class SeenSpheres:
         return SeenPlace(found, self._shown(mine, found) or outlines)
 
     def _single(self, rays: _Rays) -> Array:
-        """Places by single outlines, each where it comes nearest to a control sphere, for a capture of few images."""
+        """Return places by single outlines, each where it comes nearest to a control sphere, for few images."""
         if len(set(rays.image.tolist())) > 2:
             return np.zeros((0, 3))
         return self._nearest(rays, self._spheres.control_m).reshape(-1, 3)

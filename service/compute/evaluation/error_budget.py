@@ -123,7 +123,7 @@ def _intersect(
 
 
 def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> Closure:
-    """Closure of two measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
+    """Compare two measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
     r = a - b
     C = covariance_a + covariance_b
     square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(C), r)
@@ -136,7 +136,7 @@ def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Arra
 
 
 def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> tuple[Closure, Alignment]:
-    """Closure of two constellations (n, 3) of the same spheres in different frames, and the aligning T_a_b.
+    """Compare two constellations (n, 3) of the same spheres in different frames; return the aligning T_a_b too.
 
     The alignment is weighted by the covariances (n, 3, 3), m²; its six degrees of freedom are subtracted.
 
@@ -255,7 +255,7 @@ class ErrorBudget:
 def contributions(
     registration_m: Mapping[str, float], scan: MeasuredSpheres, ct: MeasuredSpheres | None
 ) -> tuple[Contribution, ...]:
-    """Every source of error at a target; `registration_m` holds the registration's components there, as 3D sigmas.
+    """List every source of error at a target; `registration_m` holds the registration's part there, as 3D sigmas.
 
     The total is for a point of the scan's surface in the images: the registration's components and the scan's own
     noise. The CT is listed but not counted, since it only matters where its surface is used.

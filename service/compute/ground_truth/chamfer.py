@@ -123,7 +123,7 @@ def _overlap(places: Array, runs: int) -> bool:
 
 
 def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
-    """Points and origins of several blocks, which are left out of the list so that they are not there twice."""
+    """Return points and origins of several blocks, and take them off the list so that they are not there twice."""
     points_m = np.concatenate([block.points_m for block in some])
     origin = np.concatenate([block.origin for block in some])
     some.clear()
@@ -167,7 +167,7 @@ def random_points(surface: Surface, n: int, rng: np.random.Generator) -> Array:
 
 
 def normals_at(surface: Surface, origin: IntArray) -> Array | None:
-    """Unit normals (K, 3) of samples of this origin (K,); None where the surface is a cloud without normals."""
+    """Return unit normals (K, 3) of samples of this origin (K,); None if the surface is a cloud without normals."""
     if surface.is_mesh:
         return surface.normals_of(origin)
     return None if surface.normals is None else surface.normals[origin]
@@ -345,7 +345,7 @@ def chamfer(pred: Surface, gt: Surface, settings: ChamferSettings | None = None)
 
 
 def _compared(samples: BlockedSamples, seed: int) -> Samples:
-    """Return samples whose distances are measured: all, or MOST_COMPARED at random, the same share of each block."""
+    """Select the samples whose distances are measured: all, or MOST_COMPARED at random, the same share of a block."""
     rng = np.random.default_rng([seed, samples.n])  # of its own: the other draws do not depend on it
     share = min(1.0, MOST_COMPARED / samples.n)
     some: list[IntArray] | None = None
@@ -363,7 +363,7 @@ def _compared(samples: BlockedSamples, seed: int) -> Samples:
 def _nearest(
     targets: BlockedSamples, some: Samples, queries: tuple[Array, Array, Array], outlier_m: float
 ) -> tuple[NearestOfBlocks, NearestOfBlocks, NearestOfBlocks]:
-    """Return nearest of all samples of a surface for three sets of queries (Q, 3), by the face or point they are on.
+    """Find the nearest of all samples of a surface for three sets of queries (Q, 3), by their face or point.
 
     The second set lies on that surface itself, and has no limit. `some` of the samples are looked at first.
     """

@@ -30,7 +30,7 @@ class PointIndex:
         self._tree = KDTree(np.ascontiguousarray(points, dtype=np.float64))
 
     def nearest(self, queries_m: Array, within_m: float = np.inf) -> tuple[Array, IntArray]:
-        """Return distance (Q,) in metres from each query (Q, 3) to the nearest point, and that point's index (Q,).
+        """Return the distance (Q,) in metres from each query (Q, 3) to the nearest point, and that point's index.
 
         With no point nearer than `within_m`, the distance is infinite and the index -1. A bound makes the search
         many times faster for queries that are far from all points.

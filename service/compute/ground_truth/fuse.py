@@ -184,7 +184,7 @@ def _usual_edge(surface: Surface) -> float:
 
 
 def _folded(surface: Surface, points_m: Array, of: IntArray) -> IntArray:
-    """Those of some faces whose normal turns by more than a right angle when the vertices move to these points."""
+    """Select faces whose normal turns by more than a right angle when the vertices move to these points."""
     moved = Surface(points_m, surface.faces)
     folded = np.empty(len(of), dtype=np.bool_)
     for begin in range(0, len(of), FACES):

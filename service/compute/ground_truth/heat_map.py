@@ -165,7 +165,7 @@ def _view(surface: Surface, points: Array) -> Array:
 
 
 def _splat(panel: Panel, seen: Array, pixel_m: float, shape: tuple[int, int], away: Array) -> Pixels:
-    """Return points of one surface as pixels, the nearest to the viewer on top, without paper between neighbours."""
+    """Draw the points of one surface as pixels, the nearest to the viewer on top, without paper between them."""
     at = (seen[:, :2] / pixel_m).astype(np.int64)
     order = np.argsort(-seen[:, 2])
     nearest_of = np.full(shape, -1, dtype=np.int64)

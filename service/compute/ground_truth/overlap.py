@@ -181,7 +181,7 @@ def components(surface: Surface, chosen: Mask) -> IntArray:
 
 
 def _spanning(faces: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of vertices (K,), (K,) that connect what these faces (N, 3) connect; there are fewer pairs than edges.
+    """Return pairs of vertices (K,), (K,) that connect what these faces (N, 3) connect, fewer than the edges.
 
     Vertices of number -1 are left out; the others have numbers below n.
     """
@@ -212,7 +212,7 @@ def rim_vertices(surface: Surface) -> IntArray:
 
 
 def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
-    """(N,) distance from each point (N, 3) to the nearest chosen one; infinite if none is nearer than `within_m`."""
+    """Return (N,) distance from points (N, 3) to the nearest chosen one; infinite beyond `within_m`."""
     distance = np.where(chosen, 0.0, np.inf)
     if chosen.any():
         distance[~chosen] = PointIndex(points[chosen]).nearest(points[~chosen], within_m)[0]
@@ -268,7 +268,7 @@ class Prism:
             raise DataError("a polygon needs at least three corners (x, y)", remedy="Draw it again")
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie inside; by the parity of the polygon's edges that a line from each crosses."""
+        """Return (N,) which points (N, 3) lie inside, by the parity of the edges that a line from each crosses."""
         p = apply(inverse(self.T_world_plane), points_m)
         inside = np.zeros(len(p), dtype=np.bool_)
         for a, b in zip(self.polygon_m, np.roll(self.polygon_m, -1, axis=0), strict=True):
@@ -338,7 +338,7 @@ def seen_along(corners_m: Array, along: Array, depth_m: tuple[float, float]) -> 
 
 
 def outline(points_m: Array, up: Array) -> Prism:
-    """The smallest convex prism along `up` (3,) that holds these points (N, 3): a polygon to begin drawing with."""
+    """Return the smallest convex prism along `up` (3,) that holds points (N, 3): a polygon to start drawing with."""
     T = _plane(up)
     T[:3, 3] = points_m.mean(axis=0)
     p = apply(inverse(T), points_m)

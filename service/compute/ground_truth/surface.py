@@ -89,7 +89,7 @@ class Surface:
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
     def sums_at_vertices(self, of_faces: Callable[[slice], Array]) -> Array:
-        """(V, K) sums over the faces around each vertex of what a function gives for a block of faces (N, K)."""
+        """Sum (V, K), over the faces around each vertex, what a function gives for a block of faces (N, K)."""
         total: Array | None = None
         for block in self.blocks():
             values = of_faces(block)

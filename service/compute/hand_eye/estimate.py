@@ -365,7 +365,7 @@ def _with_size(
     quality: Callable[[BoardSizeFound, _Outcome], dict[str, Any]],
     outcome: _Outcome,
 ) -> dict[str, Any]:
-    """Return `quality` of an answer with the arm's errors, which shows the board's size better than one without them."""
+    """Return `quality` of an answer with the arm's errors, which shows the board's size best."""
     return quality(sized(without_size(good, outcome.answer), outcome.answer.scale), outcome)
 
 

@@ -331,7 +331,7 @@ def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTe
 
 
 def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
-    """(P,) 0 for a length of the geometry, 1 for a twist, 2 for the zero of a joint, 3 for one of the gears."""
+    """Return (P,) 0 for a length of the geometry, 1 for a twist, 2 for the zero of a joint, 3 for a gear."""
     geometry = np.concatenate([np.tile([0, 0, 1, 2], arm.axes), np.ones(len(arm.parallel))]).astype(np.int64)
     if terms == "geometry":
         return geometry

@@ -52,7 +52,7 @@ def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel)
 
 
 def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Pixels (N, P, 2) and their derivative (N, P, 2, 6) by the (d, w) increment of each T_camera_board (N, 4, 4)."""
+    """Return pixels (N, P, 2) and derivatives (N, P, 2, 6) by the increment (d, w) of T_camera_board (N, 4, 4)."""
     points = np.einsum("nij,pj->npi", T_camera_board[:, :3, :3], points_m) + T_camera_board[:, None, :3, 3]
     shape = points.shape[:2]
 
@@ -70,7 +70,7 @@ def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraMo
 
 
 def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Array, float]:
-    """(N, 6, 6) covariance of each board pose, and the standard deviation of the corners in px that it follows from.
+    """Return (N, 6, 6) covariance of each board pose, and the corners' standard deviation in px behind it.
 
     The latter is the median over the views of their residuals' standard deviation per axis.
     """

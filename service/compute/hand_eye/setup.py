@@ -71,7 +71,7 @@ def all_closed_forms(hands: Array, boards: Array) -> dict[ClosedForm, Transform]
 
 
 def observability(hands: Array) -> tuple[float, float, float]:
-    """Largest relative rotation and RMS rotation about the second best axis (degrees), and the condition number.
+    """Return largest relative rotation and RMS rotation about the second axis (degrees), and the condition number.
 
     Raises:
         ComputeError: these rotations do not determine the translation.
@@ -137,14 +137,14 @@ class RobustStart:
 
 
 def scaled(boards: Array, scale: float) -> Array:
-    """Board poses (N, 4, 4) in the images of a board that is `scale` times as large as they were computed for."""
+    """Return board poses (N, 4, 4) as if the board were `scale` times as large as they were computed for."""
     out = boards.copy()
     out[:, :3, 3] *= scale
     return out
 
 
 def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
-    """Park's rotation, which no scale changes, and the positions with the board's scale by linear least squares.
+    """Return Park's rotation, which no scale changes, and positions with the board's scale by linear least squares.
 
     The stated size counts as one measurement with an error of 100 %, so that views that do not determine the scale
     leave it where it is; if the views fit far better without it, as with lengths in another unit, it does not count.
@@ -207,7 +207,7 @@ def mean_pose(poses: Array) -> Transform:
 
 
 def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tuple[Array, Array]:
-    """Distance in mm (of the origin, or of a point (3,) in the poses' frame) and angle in degrees from `mean`."""
+    """Return distance in mm (of the origin, or a point (3,) in the poses' frame) and angle in degrees from `mean`."""
     offset = inverse(mean) @ poses
     angle = Rotation.from_matrix(offset[:, :3, :3]).magnitude()
     point = np.zeros(3) if point_m is None else point_m
@@ -366,7 +366,7 @@ def _misread(as_read: SetupFit, found: SetupFit, words: str, remedy: str) -> Com
 
 
 def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: bool) -> Iterator[PoseReading]:
-    """Other ways to read the poses, the likeliest first; without `every` only that which may fit like the first."""
+    """Yield other ways to read the poses, likeliest first; without `every` only that which may fit like the first."""
     other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     where = (
         "beside the robot, the board on its flange" if other == "eye-to-hand" else "on the flange, the board still"
@@ -414,7 +414,7 @@ def _answers_of_a_half(hands: Array, moved: Array, boards: Array) -> Iterator[Ro
 
 
 def _split(own: NDArray[np.bool_], neighbours: NDArray[np.bool_]) -> tuple[int, int]:
-    """Number of views that fit at most if the first ones have their own poses and the others their neighbours'.
+    """Count the views that fit at most if the first have their own poses and the others their neighbours'.
 
     Also the index of the first of the others.
     """

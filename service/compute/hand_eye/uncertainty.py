@@ -61,7 +61,7 @@ def bootstrap_counts(picks: Sequence[NDArray[np.int64]], n: int) -> Array:
 
 
 def _resized_share(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> Array:
-    """(6, 6) covariance of T_flange_camera due to the uncertainty of the board's scale, for an unweighted method."""
+    """Return (6, 6) covariance of T_flange_camera due to the board's uncertain scale, for an unweighted method."""
     other = fit_resized(data, method, answer, answer.scale + answer.scale_sigma)
     step = _increment(other.T_flange_camera, answer.T_flange_camera)
     return np.outer(step, step)

@@ -115,7 +115,7 @@ class Fit:
 
 
 def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[Array, Array, Array]:
-    """Increments e (N, 6) of the flange, their derivative (N, 6, 12) by X and B, and (N, 6, 6) by the board's pose.
+    """Return the flange's increments e (N, 6), and derivatives (N, 6, 12) by X and B, (N, 6, 6) by the board's pose.
 
     All increments are (d, w) of exp(w) R, t + d in the transform's outer axes; those of e in the flange's axes.
     """
@@ -147,7 +147,7 @@ def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[
 
 
 def _rows(views: BoardViews, fit: Fit) -> tuple[Array, Array]:
-    """(N, 6, P + 1) rows [J | e] of each view at an answer, P = 13 + K, and the images' covariance (N, 6, 6) of e."""
+    """Return rows [J | e] (N, 6, P + 1) of views at an answer, P = 13 + K, and the images' covariance (N, 6, 6)."""
     boards = scaled(views.T_camera_board, fit.scale)
     e, J, JM = linearise(views.T_base_flange, boards, fit.T_flange_camera, fit.T_base_board)
     by_scale = np.einsum("nij,nj->ni", JM[:, :, :3], views.T_camera_board[:, :3, 3])
@@ -179,7 +179,7 @@ def _prior(noise: Noise, kind: NDArray[np.int64]) -> Array:
 
 
 def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
-    """Step (P,), covariance (P, P) and ½ log|H| from a summed Gram matrix (P + 1, P + 1) and the arm's prior.
+    """Return step (P,), covariance (P, P) and ½ log|H| from a summed Gram matrix (P + 1, P + 1) and the arm's prior.
 
     Raises:
         ComputeError: the system is singular.
@@ -227,7 +227,7 @@ def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITE
     prior = _prior(noise, views.kind)
 
     def minimum_at(fit: Fit) -> tuple[Array, Array]:
-        """The step from `fit` to the minimum of the linearised problem, and the covariance of all parameters."""
+        """Return the step from `fit` to the linearised problem's minimum, and the covariance of all parameters."""
         gram = _with_prior(_grams(views, noise, fit).sum(axis=0), views, fit.scale)
         step, covariance, _ = _minimum(gram, prior)
         return np.concatenate([step[:_COMMON], step[_COMMON:] - fit.arm]), covariance
@@ -336,7 +336,7 @@ def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np
 
 
 def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
-    """(R, 13 + K) increments of the answer if view i counts `counts[r, i]` times: the replicates of a bootstrap.
+    """Return increments (R, 13 + K) of the answer if view i counts `counts[r, i]` times: replicates of a bootstrap.
 
     One Gauss-Newton step from the answer, which is exact to second order in the replicates' spread.
     """
@@ -359,7 +359,7 @@ def prior_share(views: BoardViews, noise: Noise, fit: Fit) -> Array:
 
 
 def mahalanobis(views: BoardViews, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
-    """(N,) squared Mahalanobis distances of the views' increments from the model, with 6 degrees of freedom each.
+    """Return (N,) squared Mahalanobis distances of views' increments from the model, each of 6 degrees of freedom.
 
     With `known`, the fit's own uncertainty counts too: it is added to the noise of views not in the fit and
     subtracted from that of views in the fit (studentised residuals).

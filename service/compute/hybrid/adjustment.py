@@ -89,7 +89,7 @@ def solve(state: BundleState, data: AdjustmentData, sigmas: Sigmas, *, rounds: i
 
 
 def first_guess(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Sigmas:
-    """Sigmas with the tracks' from the median of their residuals, so that robust weights work from the start."""
+    """Set the tracks' sigma by the median of their residuals, so that robust weights work from the start."""
     squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
         "tracks"
     ].squares
@@ -255,7 +255,7 @@ def stated_covariance(weighted: dict[str, Rows], n: int) -> Array:
 
 
 def clustered_information(tracks: Rows, n: int) -> tuple[Array, Array]:
-    """H and M (n, n) of weighted tracks, points eliminated, for the covariance H^-1 M H^-1 of the frame parameters.
+    """Return H, M (n, n) of weighted tracks, points eliminated, for the covariance H^-1 M H^-1 of frame parameters.
 
     M is estimated from the scores of whole tracks, so it holds even if the errors within a track are correlated. With
     G tracks the plain sum of squared scores has rank G at most: for fewer tracks than parameters it would state that
@@ -307,7 +307,7 @@ def reduced_rows(rows: Rows, normal: Normal) -> Array:
 
 
 def taken_by_points(rows: Rows, normal: Normal) -> float:
-    """Trace of P V^-1 P^T: how many of a component's rows (derivative P by the points) the points themselves take."""
+    """Return the trace of P V^-1 P^T: how many of a component's rows (derivative P by the points) the points take."""
     return float(rows.point.multiply(rows.point @ _inverse_of_points(normal)).sum())
 
 
@@ -337,7 +337,7 @@ def inverse_information(information: Array) -> Array:
 
 
 def _ratio(name: str, quantity: Literal["slope", "influence"]) -> float:
-    """Expected slope or variance of a component's score over its expected weight; one for priors, which have none."""
+    """Return the expected slope or variance of a component's score over its expected weight; one for priors."""
     if name not in EXPECTED:
         return 1.0
     expected = EXPECTED[name]

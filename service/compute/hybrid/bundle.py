@@ -93,7 +93,7 @@ class Rows:
 
 
 def width(state: BundleState, data: AdjustmentData) -> int:
-    """Number of frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
+    """Count the frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
     return lens_column(state, data) + (len(LENS) if data.lens_covariance is not None else 0)
 
 
@@ -203,7 +203,7 @@ def linearise(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[
 
 
 def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose and (O, 3, 3) by the point."""
+    """Return points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose, (O, 3, 3) by the point."""
     R, t = cameras[:, :3, :3], cameras[:, :3, 3]
     v = points - t
     Rt = np.swapaxes(R, 1, 2)

@@ -36,7 +36,7 @@ _RIM = 12  # rays of an outline that are recomputed
 
 
 def camera_share(solution: BundleSolution, data: AdjustmentData, known: CameraCovariance) -> Array:
-    """Covariance (n, n) of the frame parameters due to the camera's covariance, to be added to the solution's.
+    """Return the covariance (n, n) of the frame parameters due to the camera's, to be added to the solution's.
 
     For each deviation of the camera, this takes the step that the adjustment would make with that camera: robust
     weights fixed, points adjusted, cones recomputed from the outlines' pixels.
@@ -354,7 +354,7 @@ def _block(a: Array, b: Array) -> Array:
 
 
 def _relative(R_world_scan: Array, lever_scan: Array) -> Array:
-    """(6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base; lever: x's origin minus the base's."""
+    """Return (6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base; lever: from base to x."""
     out = _block(-R_world_scan, -R_world_scan)
     out[:3, 3:] = R_world_scan @ skew(lever_scan)
     return out

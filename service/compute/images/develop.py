@@ -315,13 +315,13 @@ def _shift_of(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[float, fl
 
 
 def _refined(a: NDArray[np.float32], b: NDArray[np.float32], start: Array) -> tuple[float, float] | None:
-    """The shift by Gauss–Newton (Lucas and Kanade 1981), with gain and offset of the brightness estimated along."""
+    """Estimate the shift by Gauss–Newton (Lucas and Kanade 1981), with gain and offset of the brightness."""
     a, b = (np.asarray(cv2.GaussianBlur(part, (0, 0), _SMOOTH_PX), dtype=np.float32) for part in (a, b))
     inner = slice(_MARGIN_PX, -_MARGIN_PX)
     aim = a[inner, inner].astype(np.float64).ravel()
 
     def linearised(shift: Array) -> tuple[Array, Array, Array]:
-        """Rows of the equations, their normal matrix, and their solution: gain, offset, gain times the step."""
+        """Return rows of the equations, normal matrix, and solution: gain, offset, gain times the step."""
         # Splines: cv2.warpAffine rounds positions to 1/32 px, and the steps would never end.
         moved = ndimage.shift(b, (-shift[1], -shift[0]), order=3, mode="reflect")[inner, inner]
         dy, dx = np.gradient(moved.astype(np.float64))

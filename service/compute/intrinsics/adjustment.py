@@ -139,7 +139,7 @@ def parameters_of(camera: CameraModel, count: int) -> Array:
 
 
 def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tuple[Array, Array, Array]:
-    """Pixels (M, 2) of board points (M, 3) and their derivatives by the pose (2M, 6) and all parameters (2M, 12)."""
+    """Return pixels (M, 2) of board points (M, 3), and derivatives by pose (2M, 6) and all parameters (2M, 12)."""
     terms = np.zeros(8)
     terms[: len(camera.distortion)] = camera.distortion
     pixels, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], camera.matrix, terms)
@@ -157,7 +157,7 @@ def prior_precision(count: int) -> Array:
 def start(
     views: Sequence[BoardView], points: Array, size: tuple[int, int], model: LensModel
 ) -> tuple[CameraModel, Array]:
-    """An initial camera from some of the views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
+    """Estimate an initial camera from some views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
 
     Raises:
         ComputeError: no camera or no pose explains the views.
@@ -362,7 +362,7 @@ def _linearise(
     size: tuple[int, int],
     scale: float | None = None,
 ) -> tuple[tuple[ViewEquations, ...], float, float]:
-    """Equations of every view, Huber's cost at `scale` (default: the current one), and the current robust scale."""
+    """Return every view's equations, Huber's cost at `scale` (default: the current one), and the current scale."""
     terms = surface.bends.shape[1]
     lens, bow = np.split(theta, [len(theta) - terms])
     camera, points = camera_of(lens, size), surface.bent(bow)

@@ -285,7 +285,7 @@ def _check_view(view: BoardView, count: int, index: int) -> None:
 
 
 def _inverse_root(normal: Array) -> Array:
-    """R (P, P) with R Rᵀ = the inverse of the normal matrix: in its coordinates, the normal matrix is the identity.
+    """Return R (P, P) with R Rᵀ the inverse of the normal matrix, which is the identity in R's coordinates.
 
     Raises:
         ComputeError: the views do not determine the parameters.
@@ -301,7 +301,7 @@ def _inverse_root(normal: Array) -> Array:
 
 
 def _inflation(solution: Adjustment, root: Array, variance: float) -> tuple[float, Array]:
-    """Ratio of the covariance from images to that from corners, over all directions, and that from images (P, P).
+    """Return the covariances' ratio, images to corners, over all directions, and that from images (P, P).
 
     Each image's gradient is one sample of the errors that its corners share. It is corrected for the part that the
     solution has absorbed; otherwise few images would look too good. The shape of the covariance is still taken from

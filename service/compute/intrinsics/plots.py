@@ -49,7 +49,7 @@ def _coverage(result: IntrinsicsResult) -> Canvas:
 
 
 def _residuals(result: IntrinsicsResult) -> Canvas:
-    """Mean residual in each of 24 × 16 cells, which shows what the lens model misses, and each view's error."""
+    """Draw the mean residual in each of 24 × 16 cells, which shows what the lens model misses, and views' errors."""
     field, counts = residual_field(result)
     mean, enough = field.reshape(-1, 2), np.flatnonzero(counts >= _ENOUGH)
     cells = np.array(counts.shape[::-1])

@@ -269,7 +269,7 @@ def _pooled(per_view_px: Array, counts: Array) -> float:
 
 
 def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) -> tuple[Array, NDArray[np.int64]]:
-    """Mean residual (rows, columns, 2), px, and number (rows, columns) of the corners in each cell of the image.
+    """Return the mean residual (rows, columns, 2), px, and number (rows, columns) of corners in each image cell.
 
     Noise averages out; what remains is the error of the lens model.
     """
@@ -286,7 +286,7 @@ def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) 
 
 
 def _wide_lens(result: IntrinsicsResult) -> list[str]:
-    """Return warning that a lens is too wide for its model, if the rational one fits the same views far better."""
+    """Warn that a lens is too wide for its model, if the rational one fits the same views far better."""
     size = (result.camera.width, result.camera.height)
     try:
         wide = calibrate_intrinsics(result.corners, result.board, size, model="rational")

@@ -26,7 +26,7 @@ class BoundedMisfits:
 
 
 def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
-    """Rms distance (M,) after the best proper rigid motion of each assignment (M, n). Source: as `align_points`."""
+    """Return rms distance (M,) after the best rigid motion of each assignment (M, n). Source: as `align_points`."""
     if len(seen) == 0:
         return np.empty(0)
     a, b, _, S = _aligned(centres, seen, taken)
@@ -42,7 +42,7 @@ def _rigid_motions(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Arr
 
 
 def _aligned(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array, Array, Array]:
-    """Centred points a, b (M, n, 3), R (M, 3, 3) with a ≈ R b, and the singular values, the last one signed."""
+    """Return centred a, b (M, n, 3), R (M, 3, 3) with a ≈ R b, and the singular values, the last one signed."""
     a, b = centres[seen], centres[taken]
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
@@ -193,7 +193,7 @@ def distances(centres: Array) -> Array:
 
 
 def distinct(matches: Confusions, order: IntArray, most: int = 8) -> list[int]:
-    """Indices of the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
+    """Select the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
     chosen: list[int] = []
     known: set[frozenset[tuple[int, int]]] = set()
     for k in order[: 50 * most]:
@@ -208,7 +208,7 @@ def distinct(matches: Confusions, order: IntArray, most: int = 8) -> list[int]:
 
 
 def by_visible_count(centres: Array, matches: Confusions, order: IntArray) -> dict[int, Confusions]:
-    """The best assignments by number of visible spheres, best first; those of four are extended to more spheres."""
+    """Select the best assignments by number of visible spheres; those of four are extended to more spheres."""
     n = len(centres)
     seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
     found = {SUBSET: Confusions(seen, taken, matches.misfit[order[:2000]])}

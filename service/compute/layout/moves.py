@@ -116,7 +116,7 @@ def _quick_rating(centres: Array, required: float) -> float:
 
 
 def _rating(centres: Array, required: float) -> float:
-    """The least ratio of the layout's numbers to their required values, at most _AMPLE, minus one for each shortfall.
+    """Return the least ratio of a layout's numbers to their required values, at most _AMPLE, less one per shortfall.
 
     So among several insufficient moves, the best is the one that leaves the fewest confusable assignments.
     """

@@ -241,7 +241,7 @@ def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]
 
 
 def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]], Transform, float]:
-    """Pairs within the tolerance, the pose fitted to them, and their sum of squares relative to the tolerance's."""
+    """Return pairs within the tolerance, their fitted pose, and their sum of squares relative to the tolerance's."""
     pairs: list[tuple[int, int]] = []
     cost, T_a_b = float("inf"), start
     for _ in range(2):

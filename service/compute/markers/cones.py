@@ -100,7 +100,7 @@ def angles_to(cone: Cone, rays: Array) -> Array:
 
 
 def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
-    """Weighted least-squares fit of a cone to unit rays (N, 3) by angular (geometric) distance; Gauss–Newton."""
+    """Fit a cone to unit rays (N, 3) by weighted least squares of angular (geometric) distance; Gauss–Newton."""
 
     def step_at(cone: Cone) -> Array:
         local = rays @ cone.frame()
@@ -119,7 +119,7 @@ def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> C
 
 
 def distance_gradient(azimuth_rad: Array) -> Array:
-    """(N, 3) derivative of the angular distance of rays at these azimuths by the axis's shift along frame() and h.
+    """Return (N, 3) derivative of the angular distance of rays at these azimuths by the axis's shift and h.
 
     Tilting the axis by t towards azimuth p reduces the distance of a ray at azimuth q by t cos(p - q).
     """
@@ -127,7 +127,7 @@ def distance_gradient(azimuth_rad: Array) -> Array:
 
 
 def cones_through(triples: Array) -> tuple[Array, Array]:
-    """Return cones through triples of unit rays (K, 3, 3): axes (K, 3) and half angles (K,); NaN where degenerate."""
+    """Return cones through triples of unit rays (K, 3, 3): axes (K, 3), half angles (K,); NaN if degenerate."""
     normal = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normal, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -233,7 +233,7 @@ class ObservedCones:
         return ObservedCones(self.axes[which], self.half_angles[which], self.directions[which])
 
     def residuals(self, centres_camera_m: Array, radius_m: float) -> tuple[Array, Array]:
-        """Return residuals (O, K + 1) in radians against spheres, and their derivative (O, K + 1, 3) by the centres.
+        """Return residuals (O, K + 1) in radians against spheres, and derivatives (O, K + 1, 3) by the centres.
 
         Args:
             centres_camera_m: (O, 3) predicted centres in the camera frame.

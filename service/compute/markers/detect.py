@@ -57,7 +57,7 @@ _DISTINCT = 0.85  # of the larger radius: a sphere closer behind another is too 
 def detect_spheres(
     image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline, ...]:
-    """Return outlines of all spheres in an image (H, W, 3), the most certain first; an empty tuple if there are none.
+    """Find the outlines of all spheres in an image (H, W, 3), the most certain first; empty if there are none.
 
     Everything that looks like a sphere is returned; identity and registration decide which are markers.
 
@@ -235,7 +235,7 @@ def _of_one_colour(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """Return discs of the spheres' colour; doubtful ones only if the colour is given or learnt from clear discs."""
+    """Select the discs of the spheres' colour; doubtful ones only if it is given or learnt from clear discs."""
     if given is not None:
         roughs = [r for r in roughs if share(coarse, camera, r.cone, given) >= _LEAST_SHARE]
     model = _learnt(roughs, options) or given

@@ -59,7 +59,7 @@ def profiles_of(cones: Sequence[Cone], camera: CameraModel, n_azimuths: int, off
 
 
 def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDArray[np.float32]:
-    """Bilinear values (K, J[, C]) at pixels (K, J, 2), at exact positions; cv2.remap would round them to 1/32 px."""
+    """Return bilinear values (K, J[, C]) at exact pixels (K, J, 2); cv2.remap would round them to 1/32 px."""
     h, w = image.shape[:2]
     x = np.clip(pixels[..., 0], 0, w - 1.001)
     y = np.clip(pixels[..., 1], 0, h - 1.001)

@@ -102,7 +102,7 @@ def _widened(box: Box) -> Box:
 
 
 def _rough(image_bgr: NDArray[np.uint8], camera: CameraModel, ellipse: EllipseEstimate) -> RoughSphere | None:
-    """The cone through an ellipse in pixels; None if the ellipse does not fit its mask or is not an outline."""
+    """Return the cone through an ellipse in pixels; None if it does not fit its mask or is not an outline."""
     if ellipse.loss > MOST_LOSS:
         return None
     t = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False)
@@ -233,7 +233,7 @@ def _prepared(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> Floats:
 
 
 def normalised(picture: NDArray[np.uint8], size: tuple[int, int]) -> Floats:
-    """(1, 3, h, w) RGB of a BGR picture resized to (w, h), with the mean and deviation of the training images."""
+    """Return (1, 3, h, w) RGB of a BGR picture resized to (w, h), with the training images' mean and deviation."""
     larger = size[0] > picture.shape[1]
     resized = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA)
     rgb = np.asarray(resized, dtype=np.float32)[:, :, ::-1] / np.float32(255)

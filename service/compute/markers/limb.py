@@ -116,7 +116,7 @@ def _coded(linear: Array32, *, srgb: bool) -> tuple[Array32, Array32]:
 
 
 def _smoothing(t: Array, wide: Array, blur: Array) -> tuple[Array32, Array32]:
-    """(G, J', J) matrices that blur values at `wide` by Gaussians (G,) and sample at `t`, and their derivative."""
+    """Return matrices (G, J', J) that blur values at `wide` by Gaussians (G,) and sample at `t`, and derivatives."""
     s = blur[:, None, None]
     square = (t - wide[:, None]) ** 2
     weight = np.exp(-0.5 * square / s**2)
@@ -215,7 +215,7 @@ def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32
 
 
 def evaluate(p: Array, blur: Array, chroma_blur: Array, model: LimbModel) -> tuple[Array32, Array32]:
-    """Jacobian and, last, residual (G, 13, 3, K, J) of the model in Y, Cb, Cr; the sphere's share (G, K, J)."""
+    """Return the model's Jacobian and, last, residual (G, 13, 3, K, J) in Y, Cb, Cr; the sphere's share (G, K, J)."""
     shown = _shown(p, blur, model)
     mixed, S, sharp = shown.mixed, shown.share, model.sharp
     G, K, wider = S.shape
@@ -350,7 +350,7 @@ class _Shading:
 
 
 def _products(rows: Array32, share: Array32, inside: Array, outside: Array) -> Array:
-    """Products (G, K, 13, 13) of the rows, weighted by their standard deviations (G, 3) on both sides of the edge.
+    """Return products (G, K, 13, 13) of the rows, weighted by standard deviations (G, 3) on both sides of the edge.
 
     `rows` (G, 13, 3, K, J) are weighted in place, and (G, K, J) is the sphere's `share` in each sample.
     """
@@ -374,7 +374,7 @@ def _moved(p: Array, delta: Array, reach: float) -> Array:
 def _gauss_newton(
     normal: Array, p: Array, priors: tuple[tuple[int, Array | float, Array | float], ...], good: Mask
 ) -> tuple[Array, Array, Array]:
-    """Steps of the profiles' own (G, K, 10) and of the outlines' (G, 2) parameters, and the offset's formal variance.
+    """Return steps of the profiles' (G, K, 10) and outlines' (G, 2) parameters, and the offset's formal variance.
 
     `normal` (G, K, 13, 13) holds the weighted products of the Jacobian's columns and, last, the residual. The
     profiles' own parameters are eliminated; `priors` are (index, value, sigma); `good` selects the profiles used for

@@ -134,7 +134,7 @@ def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | N
 
 
 def in_the_middle(joined: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """The component at the middle of a (side, side) mask, which is opened and closed first; None if there is none."""
+    """Return the component at the middle of a (side, side) mask, opened and closed first; None if there is none."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     smooth = np.asarray(cv2.morphologyEx(cv2.morphologyEx(joined, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel))
     _, parts = cv2.connectedComponents(smooth.astype(np.uint8))
@@ -184,7 +184,7 @@ def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
 
 
 def middle_colour(image_bgr: NDArray[np.uint8], ellipse: EllipseEstimate) -> tuple[float, float, float]:
-    """The median colour (blue, green, red; 0..255) of an ellipse's middle; black if that is outside the image."""
+    """Return the median colour (blue, green, red; 0..255) of an ellipse's middle; black outside the image."""
     reach = max(2, round(0.4 * min(ellipse.a, ellipse.b)))
     u, v = round(ellipse.x), round(ellipse.y)
     middle = image_bgr[max(0, v - reach) : max(0, v + reach), max(0, u - reach) : max(0, u + reach)]

@@ -192,7 +192,7 @@ def _starts(
     pose: Transform,
     options: DetectionOptions,
 ) -> dict[int, AveragedCone] | None:
-    """Return cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
+    """Return cones good to about a pixel for measurement: approached ones, and predictions by these for the others.
 
     None if the approached spheres do not agree on a pose.
     """
@@ -234,7 +234,7 @@ def visible_cones(
     *,
     least: float = _LEAST_PART,
 ) -> dict[int, Cone]:
-    """Cones of the spheres of whose outline the `least` share is in the image and not behind another sphere."""
+    """Return cones of spheres with the `least` share of their outline in the image and not behind another sphere."""
     centres = apply(T_camera_scan, centres_scan_m)
     distance = np.linalg.norm(centres, axis=1)
     cones = {
@@ -306,7 +306,7 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
 def _approached_pose(
     image: NDArray[np.uint8], camera: CameraModel, expected: PredictedSpheres, shown: dict[int, Cone]
 ) -> Transform:
-    """Return image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
+    """Compute the image's pose from circles near predicted ones: from a few spheres, or all if those disagree."""
     order = _spread({m: cone for m, cone in shown.items() if expected.votes(m)})
     roughs: dict[int, Cone] = {}
     for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):

@@ -187,7 +187,7 @@ class ColourModel:
         return np.asarray(np.where(np.hypot(along, across) < self.palest, 9.0, off), dtype=np.float64)
 
     def paler(self) -> ColourModel | None:
-        """The model for pale pictures of cheap cameras, by its hue; None if the colour has hardly any saturation."""
+        """Return the model for cheap cameras' pale pictures, by its hue; None if the colour is hardly saturated."""
         pale = float(np.linalg.norm(self.middle)) > 2 * self.tolerance
         return replace(self, palest=_PALEST) if pale else None
 
@@ -242,7 +242,7 @@ def given_colour(colour_bgr: Colour, tolerance: float, *, srgb: bool) -> ColourM
 
 
 def chromaticity(colours_bgr: Array, *, srgb: bool = True) -> Array:
-    """(N, 2) opponent colours over the channel sum, of colours (N, 3) 0..255; independent of the light's strength.
+    """Return (N, 2) opponent colours over channel sum, of colours (N, 3) 0..255; independent of light's strength.
 
     They are red minus green and blue minus yellow, divided by the sum: a stronger lamp scales all channels alike.
     """

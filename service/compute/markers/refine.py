@@ -284,7 +284,7 @@ def _offsets(radius: Array, blurs: Sequence[float], step: float) -> Array:
 def _measured(
     i: int, cone: Cone, limb: LimbFit, fit: _ConeFits, worth: tuple[float, Array, float], unit: int
 ) -> _SubpixelCone | None:
-    """Outline `i`, or None if unreliable; `worth`: radians per unit, covariance in squared units, contrast."""
+    """Return outline `i`, or None if unreliable; `worth`: radians per unit, covariance in squared units, contrast."""
     angle, covariance, contrast = worth
     blur_px = float(limb.blur[i]) * unit
     if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
@@ -354,7 +354,7 @@ def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bo
 
 
 def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
-    """(G, 3, 3) covariance of the cone's two directions and half angle, in squared units, from edge points' scatter.
+    """Return (G, 3, 3) covariance of a cone's directions and half angle, in squared units, from edge points' scatter.
 
     Neighbouring edge points share pixels, texture and shading, so their errors are correlated. Means over blocks of
     the outline show by how much they exceed those of independent points; that factor multiplies the plain covariance.

@@ -54,7 +54,7 @@ def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
 def find_candidates(
     image: NDArray[np.uint8], least_radius: float, greatest_radius: float, min_vote: float, limit: int
 ) -> list[CircleCandidate]:
-    """Return circles with radii in a range (pixels of this image), the most votes first, one for each place and size.
+    """Find circles with radii in a range (pixels of this image), the most votes first, one per place and size.
 
     Each octave of radii is searched in a copy where its smallest radius is about eleven pixels.
     """
@@ -365,7 +365,7 @@ def share(
     model: ColourModel,
     reach: tuple[float, float] = (0.0, 0.92),
 ) -> float:
-    """Share of a disc, or of the ring between two fractions of its radius, that has the spheres' colour."""
+    """Return the share of a disc, or of the ring between two fractions of its radius, with the spheres' colour."""
     low, high = reach
     rings = np.sqrt(low**2 + (high**2 - low**2) * (np.arange(8) + 0.5) / 8)
     azimuth = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)

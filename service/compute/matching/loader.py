@@ -146,7 +146,7 @@ def _with_ground_truth(depth_m: NDArray[np.float32], step: int) -> Array:
 
 
 def look_up(world_m: Array, view: View) -> tuple[Array, NDArray[np.uint8]]:
-    """Return pixels (N, 2) of points (N, 3) of the surface in a view, and their status (N,); NaN points are UNKNOWN.
+    """Return pixels (N, 2) of surface points (N, 3) in a view, and their status (N,); NaN points are UNKNOWN.
 
     At the outline of what hides a point, the status is exact to a pixel.
     """
@@ -173,7 +173,7 @@ def look_up(world_m: Array, view: View) -> tuple[Array, NDArray[np.uint8]]:
 
 
 def surface_depth(depth_m: NDArray[np.float32], K: Array, pixels: Array) -> Array:
-    """(N,) depth between the pixel centres; NaN outside the image, without ground truth, and at edges of the surface.
+    """Return (N,) depth between pixel centres; NaN outside the image, without ground truth, and at surface edges.
 
     The inverse depth of a plane is linear in the pixel, so it is what is interpolated: exact on the faces of a mesh.
     """

@@ -46,7 +46,7 @@ class Covisibility:
 
 
 def points_seen(points_m: Array, view: View) -> NDArray[np.bool_]:
-    """Mask (P,) of the surface points (P, 3) that a view shows: neither occluded nor covered by a marker."""
+    """Return the mask (P,) of surface points (P, 3) that a view shows: not occluded or covered by a marker."""
     return look_up(points_m, view)[1] == VISIBLE
 
 

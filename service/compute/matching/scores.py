@@ -25,7 +25,7 @@ PRECISION_PX = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0)  # at which precision is measured
 
 
 def match_errors_px(matches: Matches, first: View, second: View) -> Array:
-    """Errors (M,): distance of each match in the second image from the true correspondence of its pixel in the first.
+    """Return errors (M,): distance of each match in the second image from its true place there.
 
     Infinite where the second image does not show the point, so that there is nothing to match. NaN without ground
     truth, such as beside the specimen or on a marker: such matches are not scored.
@@ -44,7 +44,7 @@ def precisions(errors_px: Array) -> tuple[float, ...]:
 
 
 def fundamental_matrix(T_second_first: Transform, K_first: Array, K_second: Array) -> Array:
-    """F (3, 3) with x_second^T F x_first = 0 for corresponding pixels (Hartley and Zisserman, 2nd edition, 9.2.4)."""
+    """Return F (3, 3) with x_second^T F x_first = 0 for corresponding pixels (Hartley and Zisserman 2004, 9.2.4)."""
     E = skew(T_second_first[:3, 3]) @ T_second_first[:3, :3]
     return np.linalg.inv(K_second).T @ E @ np.linalg.inv(K_first)
 

@@ -43,7 +43,7 @@ class PixelRays:
         return (self.rows[begin:end] @ flat).reshape(end - begin, self.width, 2)
 
     def turned(self, rotation: Array) -> NDArray[np.float32]:
-        """(K, width, 3) columns of the directions rotation (3, 3) @ (x, y, 1): multiply by `rows` as float32."""
+        """Return (K, width, 3) columns of directions rotation (3, 3) @ (x, y, 1): multiply by `rows` as float32."""
         turned = self.columns @ rotation[:, :2].T
         turned[0] += rotation[:, 2]  # the first basis function of the rows is 1
         return turned.astype(np.float32)
@@ -100,7 +100,7 @@ def _basis(size: int, degree: int) -> Array:
 
 
 def _error_px(rays: PixelRays, camera: CameraModel) -> float:
-    """Largest distance between a pixel and the projection of its ray, over a grid that reaches the image's edges."""
+    """Return the largest distance between a pixel and its ray's projection, over a grid up to the image's edges."""
     u, v = (np.unique(np.linspace(0, size - 1, _CHECKED).astype(int)) for size in (rays.width, rays.height))
     xy = np.einsum("vk,kuc->vuc", rays.rows[v], rays.columns[:, u])
     points = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2).reshape(-1, 3)
@@ -147,7 +147,7 @@ class RayMesh:
         return np.asarray(self._scene.run(np.broadcast_to(origin, directions.shape), directions), dtype=np.int32)
 
     def depths(self, T_world_camera: Transform, rays: Array) -> Array:
-        """Depth (N,) along z at which rays (N, 3) of a camera, with z = 1, meet the surface; NaN where they do not.
+        """Return depths (N,) along z at which rays (N, 3) of a camera, z = 1, meet the surface; NaN if they do not.
 
         Raises:
             ConfigurationError: embreex, which casts the rays, is not installed.
@@ -160,7 +160,7 @@ class RayMesh:
         return np.where((face >= 0) & np.isfinite(depth) & (depth > 0), depth, np.nan)
 
     def planes_seen(self, T_world_camera: Transform) -> Array:
-        """(F + 1, 4) each face's unit normal towards the camera, in its frame, and n · p (≤ 0) for its points p.
+        """Return (F + 1, 4) faces' unit normals towards the camera, in its frame, and n · p (≤ 0) for their points p.
 
         The last row, which the index -1 names, is zero.
         """

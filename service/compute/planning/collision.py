@@ -63,7 +63,7 @@ class Contact:
 
 
 def link_segments(body: ArmBody, joints_rad: Array) -> tuple[Array, Array, Array]:
-    """Capsules of the P parts at joints (K, N): starts (K, P, 3), ends (K, P, 3), radii (P,), in the base frame."""
+    """Return capsules of P parts at joints (K, N): starts, ends (K, P, 3) and radii (P,), in the base frame."""
     links, frames = body.model.links, chain(body.model.joint_values(joints_rad))
     T_base_part = np.concatenate(
         [frames[:, [link.frame for link in links]], frames[:, -1:] @ body.T_flange_camera], axis=1
@@ -76,7 +76,7 @@ def link_segments(body: ArmBody, joints_rad: Array) -> tuple[Array, Array, Array
 
 
 def nearest_contacts(body: ArmBody, obstacles: Obstacles, joints_rad: Array) -> list[Contact]:
-    """The pair with the least clearance at each of the joints (K, N), without pairs that the arm's model allows."""
+    """Find the pair with the least clearance at each of the joints (K, N), except pairs that the model allows."""
     starts, ends, radii = link_segments(body, joints_rad)
     parts, allowed = body.parts, body.model.allowed
     pairs: list[tuple[str, str]] = []
@@ -113,7 +113,7 @@ def nearest_contacts(body: ArmBody, obstacles: Obstacles, joints_rad: Array) -> 
 
 
 def straight_path(start_rad: Array, end_rad: Array, step_rad: float) -> Array:
-    """Joints (K, N) on the straight path in joint space, both ends included, in steps of at most `step_rad`."""
+    """Return joints (K, N) on the straight path in joint space, both ends included, at most `step_rad` apart."""
     count = max(1, int(np.ceil(float(np.abs(end_rad - start_rad).max()) / step_rad)))
     return start_rad + np.linspace(0.0, 1.0, count + 1)[:, None] * (end_rad - start_rad)
 
@@ -122,7 +122,7 @@ _TINY = 1e-15
 
 
 def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
-    """Least distance (...,) between segments p0–p1 and q0–q1, all (..., 3), broadcast; a segment may be a point.
+    """Return least distances (...,) between segments p0–p1 and q0–q1, (..., 3), broadcast; points are segments too.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
@@ -142,7 +142,7 @@ def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
 
 
 def segment_box_distance_m(p0: Array, p1: Array, half_extent_m: Array) -> Array:
-    """Least distance (...,) of segments p0–p1 (..., 3) to the box of ± half extents (3,) at the origin; 0 inside.
+    """Return least distances (...,) of segments p0–p1 (..., 3) to a box of ± half extents (3,) at 0; 0 inside.
 
     The distance to a convex body is convex along a segment, so ternary search finds its minimum, to a micrometre on
     segments of a metre.

@@ -115,7 +115,7 @@ def seen(
     T_scan_camera: Transform | None = None,
     camera: CameraModel | None = None,
 ) -> NDArray[np.bool_]:
-    """(N,) points that a camera at `eye_m` (3,) sees at a good angle; with a camera, only those in its image."""
+    """Return (N,) points that a camera at `eye_m` (3,) sees at a good angle; with a camera, those in its image."""
     way = eye_m - surface.points_m
     distance = np.linalg.norm(way, axis=1)
     facing = np.einsum("ni,ni->n", way, surface.normals) / distance
@@ -144,7 +144,7 @@ def _all_near(near: NDArray[np.bool_], faces: NDArray[np.integer]) -> NDArray[np
 
 
 def _up(spheres_m: Array, surface: Surface) -> Array:
-    """Unit vector (3,) away from the board, on which the spheres stand: most surface around them is the board's."""
+    """Return the unit vector (3,) away from the spheres' board: most of the surface around them is the board's."""
     normal = np.linalg.svd(spheres_m - spheres_m.mean(axis=0))[2][2]
     total = np.zeros(3)
     for block in surface.blocks():

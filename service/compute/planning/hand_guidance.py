@@ -141,7 +141,7 @@ def covered(places: Iterable[WantedView], T_level_cameras: Sequence[Transform], 
 
 
 def nearest(places: Iterable[WantedView], T_level_here: Transform) -> WantedView:
-    """The place with the shortest way from here, a radian of rotation counting as 40 cm. `places` is not empty."""
+    """Return the place nearest to here, a radian of rotation counting as 40 cm. `places` is not empty."""
 
     def way(place: WantedView) -> float:
         moved = float(np.linalg.norm(place.T_level_camera[:3, 3] - T_level_here[:3, 3]))

@@ -189,7 +189,7 @@ def _blurred(T_base_camera: Transform, scene: PlanningScene) -> str:
 
 
 def travel_times_s(joints_rad: Array, scene: PlanningScene) -> Array:
-    """(K, K) time between joint positions (K, N), by the joint that turns farthest: ramp up, constant, ramp down."""
+    """Return (K, K) times between joint positions (K, N), by the farthest turn: ramp up, constant, ramp down."""
     distance = np.zeros((len(joints_rad), len(joints_rad)))
     for turns in joints_rad.T:
         np.maximum(distance, np.abs(turns[:, None] - turns[None]), out=distance)
@@ -209,7 +209,7 @@ def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: floa
 
 
 def shortest_order(times_s: Array, working: Callable[[], None] = lambda: None) -> list[int]:
-    """A short open path from node 0 through all others, for times (K + 1, K + 1); indices 0 … K − 1 of the others.
+    """Find a short open path from node 0 through all others, for times (K + 1, K + 1); indices 0 … K − 1 of them.
 
     Starts from the better of the listed order and the nearest-neighbour order and improves it by 2-opt until no
     reversal helps. It is deterministic and never longer than the listed order. `working` is called again and again.
@@ -333,13 +333,13 @@ def best_posture(T_base_camera: Transform, scene: PlanningScene) -> Array | None
 
 
 def _other_way(here: Array, view: PlannedView, scene: PlanningScene) -> Array | None:
-    """Joints (N,) of another posture for a view that can be reached straight from `here`; None if there is none."""
+    """Find joints (N,) of another posture for a view, reached straight from `here`; None if there is none."""
     others = islice(able_postures(view.T_base_camera, scene), 1, _MOST_WAYS)
     return next((q for q in others if not scene.freedom.obstruction_between(here, q)), None)
 
 
 def _round_about(here: Array, view: PlannedView, scene: PlanningScene) -> PlannedView:
-    """The view with a detour from `here`, in the first of its postures to which one is found; else as it is."""
+    """Return the view with a detour from `here`, in its first posture to which one is found; else as it is."""
     for joints_rad in islice(able_postures(view.T_base_camera, scene), _ROUND_POSTURES):
         between = detour(here, joints_rad, scene.freedom)
         if between is not None:

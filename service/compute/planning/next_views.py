@@ -67,7 +67,7 @@ def view_information(
 def predicted_information(
     T_base_camera: Transform, spheres_base_m: Array, radius_m: float, centre_m: Array, cone_covariance: Array
 ) -> Array:
-    """Information (6, 6) predicted for a view of spheres (K, 3) with outlines of this covariance (3, 3)."""
+    """Predict the information (6, 6) of a view of spheres (K, 3) with outlines of this covariance (3, 3)."""
     normal = np.zeros((6, 6))
     weight = np.linalg.inv(cone_covariance)
     for sphere in spheres_base_m:
@@ -104,7 +104,7 @@ def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: fl
 
 
 def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
-    """Covariance (6, 6) of the scan's pose from views with these informations (6, 6) and pose errors P each.
+    """Return the covariance (6, 6) of the scan's pose from views with these informations and pose errors P each.
 
     Raises:
         ComputeError: the views together do not determine the pose.
@@ -171,7 +171,7 @@ def lens_covariance_of_pose(
 
 
 def point_sigmas_m(covariance: Array, points_m: Array) -> Array:
-    """Standard deviation (N,) in 3D, metres, at points (N, 3) from the centre, for a covariance (6, 6) of (d, w)."""
+    """Return 3D sigmas (N,), metres, at points (N, 3) from the centre, for a covariance (6, 6) of (d, w)."""
     J = place_jacobian(points_m)
     return np.sqrt(np.einsum("nij,jk,nik->n", J, covariance, J))
 
@@ -201,7 +201,7 @@ class CurrentInformation:
     shared: Array | None = field(default=None, repr=False)  # (6, 6) covariance that further views do not reduce
 
     def error_m(self, *more: Array) -> float:
-        """Predicted error of the worst target, m, with this further information added; infinite if undetermined."""
+        """Predict the worst target's error, m, with this further information added; infinite if undetermined."""
         try:
             covariance = pose_covariance([*self.informations, *more], self.pose_covariance)
         except ComputeError:
@@ -228,7 +228,7 @@ def next_best_views(
     min_coverage: float,
     at_most: int = 6,
 ) -> tuple[Suggestion, ...]:
-    """The shortest greedy list of viewpoints that brings error and coverage within limits, or `at_most` of them.
+    """Choose a short list of viewpoints greedily that brings error and coverage within limits, or `at_most` of them.
 
     While the error exceeds its limit, each choice minimises it; among equals, the one with the largest coverage, then
     the nearest wins. After that, each choice maximises coverage.

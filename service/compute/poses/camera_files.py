@@ -38,7 +38,7 @@ _SIMULATED = "simulated"  # of a camera that a simulated rig had
 
 
 def read_camera_json(path: Path) -> CameraModel:
-    """Camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
+    """Read a camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (OpenCV).
 
     A file written by `calibrate intrinsics` also holds the calibration's results, and one of a simulated data set
     says so. Any other key is refused, since it could change the meaning of the numbers.
@@ -71,7 +71,7 @@ def write_camera_json(path: Path, camera: CameraModel, *, simulated: bool = Fals
 
 
 def read_spheres_json(path: Path) -> ScanSpheres:
-    """Spheres in the scan frame, from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
+    """Read scan-frame spheres from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
 
     `details`, which the `spheres` command adds for each sphere, is ignored.
 

@@ -242,7 +242,7 @@ def _camera_axes(document: Mapping[str, Any]) -> Transform:
 
 
 def _centre_beside(path: Path) -> Array:
-    """The centre (3,) that our own exporters of the unit box subtracted from the positions, in metres; else zero."""
+    """Return the centre (3,), in metres, that our unit box exporters subtracted from the positions; else zero."""
     beside = path.parent / "unit_box.json"
     if not beside.is_file():
         return np.zeros(3)

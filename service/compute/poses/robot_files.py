@@ -182,7 +182,7 @@ def matched_rows(table: RobotPoseTable, images: Sequence[str], path: Path) -> di
 
 
 def other_orders(rows: Mapping[str, int]) -> Iterator[tuple[dict[str, int], str]]:
-    """The row of each image if the poses were put to the images in another order of the names, and it in words."""
+    """Yield the rows of the images if the poses followed another order of names, and the text for that order."""
     counted_up, spelt = sorted(rows, key=natural), sorted(rows)
     if counted_up != spelt:
         words = "if they were put to the images in the order {}"

@@ -199,7 +199,7 @@ def encode_pose(stamp_ns: int, frame: str, T: Transform, covariance: Array) -> b
 
 
 def decode_pose(data: bytes) -> StampedTransform:
-    """A geometry_msgs/PoseStamped, or one with a covariance, which is left out; `child` is "". Raises CdrError."""
+    """Decode a geometry_msgs/PoseStamped, or one with a covariance, left out; `child` is "". Raises CdrError."""
     read = CdrReader(data)
     stamp_ns, frame = _read_header(read)
     return StampedTransform(stamp_ns, frame, "", _read_transform(read))

@@ -182,7 +182,7 @@ def _chosen(edge: _Edge, child: str, stamp_ns: int, timing: Timing) -> FoundPose
 
 
 def _interpolated(T_before: Transform, T_after: Transform, share: float) -> Transform:
-    """The pose in between: the position on the line, the rotation about the axis that leads from one to the other."""
+    """Interpolate the pose: the position on the line, the rotation about the axis from one to the other."""
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second
 
     turned = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_before[:3, :3], T_after[:3, :3]])))(share)
@@ -321,7 +321,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, bytes]]:
 
 
 def _records(path: Path) -> Iterator[Any]:
-    """Yield records of a file and of its chunks; the sizes that chunks state are checked before they are unpacked."""
+    """Yield the records of a file and of its chunks; the sizes of chunks are checked before they are unpacked."""
     from lz4.frame import get_frame_info  # noqa: PLC0415 - come with mcap
     from mcap.records import Chunk  # noqa: PLC0415
     from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415

@@ -72,7 +72,7 @@ def odd_images(
 
 
 def too_many(odd: Collection[int], images: PosedImages) -> Contradiction | None:
-    """Return finding that so many images contradict one another that none can be left out; None if they are few."""
+    """Report that so many images contradict one another that none can be left out; None if they are few."""
     n = len(images.poses)
     if len(odd) <= MOST_LEFT_OUT * n:
         return None

@@ -214,7 +214,7 @@ def _triples(seen: Sightings, D: int, centres: Array) -> tuple[NDArray[np.int64]
 
 
 def _kabsch(model: Array, image: Array) -> tuple[Array, Array]:
-    """Rotations (K, 3, 3) and translations (K, 3) with image = R model + t, for batches (K, 3, 3) of three points."""
+    """Return rotations (K, 3, 3) and translations (K, 3) with image = R model + t, for three points each."""
     cm, ci = model.mean(axis=1), image.mean(axis=1)
     H = np.einsum("kni,knj->kij", image - ci[:, None], model - cm[:, None])
     U, _, Vt = np.linalg.svd(H)
@@ -296,7 +296,7 @@ def _damped_steps(J: Array, r: Array) -> Array:
 
 
 def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: float) -> tuple[NDArray[np.int64], Array]:
-    """Return number of detections (K,) that each pose explains within loose gates, and their mean angle in radii."""
+    """Count the detections (K,) that each pose explains within loose gates; return their mean angle in radii too."""
     counts = np.zeros(len(R), dtype=np.int64)
     error = np.zeros(len(R))
     for start in range(0, len(R), 2000):
@@ -324,7 +324,7 @@ def _refine(
     radius_m: float,
     focal_px: float,
 ) -> Hypothesis | None:
-    """The assignment solved from all its outlines, without those that do not fit and with further ones that do."""
+    """Solve an assignment from all its outlines, without those that do not fit and with further ones that do."""
     for _ in range(6):
         pick, chosen = np.array(list(markers)), np.array(list(markers.values()))
         new_R, new_t, _ = _pose_steps(seen, pick[None], centres[chosen][None], rotation[None], t[None], radius_m, 5)

@@ -290,7 +290,7 @@ def _metric_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[t
 
 
 def _similarity_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
-    """Compute initial similarities from pairs of images: their rotations must agree, their distance gives the scale."""
+    """Compute similarities to start from pairs of images: rotations must agree, their distance gives the scale."""
     ranked = sorted(
         ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
         reverse=True,

@@ -116,7 +116,7 @@ def with_joint_pose_covariance(registration: RegistrationResult, covariance: Arr
 
 
 def of_inverse(T_a_b: Transform, covariance: Array) -> Array:
-    """Covariance of T_b_a (6, 6) from that of T_a_b: with R and t of T_a_b, d' = -R^T (d + t x w), w' = -R^T w."""
+    """Return the covariance of T_b_a (6, 6) from that of T_a_b with R, t: d' = -R^T (d + t x w), w' = -R^T w."""
     R, t = T_a_b[:3, :3], T_a_b[:3, 3]
     J = np.zeros((6, 6))
     J[:3, :3], J[3:, 3:] = -R.T, -R.T

@@ -191,7 +191,7 @@ def assemble(
 
 
 def _common_prior(settings: RegistrationSettings) -> Array:
-    """Information (6 + k, 6 + k) of the errors that all outlines share: light, shift and growth, then intrinsics."""
+    """Return information (6 + k, 6 + k) on errors that all outlines share: light, shift and growth, intrinsics."""
     e = settings.common_errors
     sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
     common = np.diag(1 / sigma**2)
@@ -256,7 +256,7 @@ def _common_displacements(cones: ObservedCones, camera: CameraModel) -> Array:
 
 
 def _intrinsics_errors(cones: ObservedCones, camera: CameraModel) -> Array:
-    """Displacement (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, with the image pixels fixed."""
+    """Return displacements (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, at fixed image pixels."""
     z = cones.axes[:, 2]
     x, y = cones.axes[:, 0] / z, cones.axes[:, 1] / z
     r2, zero = x**2 + y**2, np.zeros(len(cones))
@@ -313,7 +313,7 @@ def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
 
 
 def _point_rows(problem: Problem, centres: Array, cost: PointCost) -> tuple[Array, Array]:
-    """Three rows per outline with the normal equations of its points: derivative (O, 3, 3) and residual (O, 3)."""
+    """Return three rows per outline with its points' normal equations: derivative (O, 3, 3) and residual (O, 3)."""
     n = len(centres)
     N, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for start in range(0, n, _CHUNK):
@@ -360,7 +360,7 @@ class Blocks:
 
 
 def compress(J: Array, A: Array, r: Array, image: NDArray[np.int64], n_images: int, weights: Array) -> Blocks:
-    """Blocks from outlines' J (O, 3, n), A (O, 3, 6) and r (O, 3), each in `image` (O,) and with a weight (O,)."""
+    """Build blocks from outlines' J (O, 3, n), A (O, 3, 6) and r (O, 3), each of an `image` (O,) and a weight."""
     n = J.shape[2]
     root = np.sqrt(weights)[:, None, None]
     F = np.concatenate([J, A, r[:, :, None]], axis=2) * root

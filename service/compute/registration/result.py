@@ -60,7 +60,7 @@ class Solution:
         return np.asarray(p.own_light_m**2 * moved @ moved.T, dtype=np.float64)
 
     def pose_gain(self) -> Array:
-        """(N, 6, n) K with xi = K dx + own error of covariance Q: how pose errors follow the common unknowns."""
+        """Return (N, 6, n) K with xi = K dx + own error of covariance Q: pose errors follow the common unknowns."""
         return -(self.marginal.Q @ self.blocks.JA.transpose(0, 2, 1)) / self.outline_factor
 
 
@@ -124,7 +124,7 @@ class RegistrationResult:
         return {"outlines and poses": noise, "common": common, "spheres": spheres}
 
     def refined_gain(self) -> tuple[Array, Array]:
-        """How errors move the scan relative to `T_scan_camera_refined`, averaged over all images with outlines.
+        """Return how errors move the scan relative to `T_scan_camera_refined`, averaged over images with outlines.
 
         Returns:
             (6, n) by errors of the n common unknowns, and the (6, 6) covariance by the images' own errors.
@@ -148,11 +148,11 @@ class RegistrationResult:
         return by_common, own
 
     def sigma_map_m(self, points_scan_m: Array) -> Array:
-        """Target registration error: predicted standard deviation (N,) in m, 3D, at points (N, 3) of the scan."""
+        """Predict the target registration error: 3D standard deviation (N,) in m at points (N, 3) of the scan."""
         return np.sqrt(_variance_m2(points_scan_m @ self.T_world_scan[:3, :3].T, self.covariance))
 
     def sigma_at_m(self, point_scan_m: Array) -> float:
-        """Target registration error: predicted standard deviation (3D) in metres at a point (3,) of the scan."""
+        """Predict the target registration error: 3D standard deviation in metres at a point (3,) of the scan."""
         return float(self.sigma_map_m(np.asarray(point_scan_m)[None])[0])
 
     def covariance_at_m2(self, point_scan_m: Array) -> Array:
@@ -169,7 +169,7 @@ class RegistrationResult:
 
 
 def _variance_m2(turned: Array, covariance: Array) -> Array:
-    """Trace (N,) of the position covariance of points `turned` (N, 3): rotated, relative to the scan's origin."""
+    """Return traces (N,) of the position covariance of points `turned` (N, 3): rotated, from the scan's origin."""
     # The expectation of |d + w x v|^2: tr D + 2 v . E[d x w] + |v|^2 tr W - v' W v
     D, X, W = covariance[:3, :3], covariance[:3, 3:6], covariance[3:6, 3:6]
     twist = np.array([X[1, 2] - X[2, 1], X[2, 0] - X[0, 2], X[0, 1] - X[1, 0]])

@@ -233,7 +233,7 @@ def _robust_weights(
 
 
 def _distances(problem: Problem, here: _Iterate, weighting: _Weighting) -> tuple[Array, Array]:
-    """Return norm of each outline's residual (O,), in its standard deviations and in px, with pose errors removed."""
+    """Return norms of outlines' residuals (O,), in standard deviations and in px, with pose errors removed."""
     blocks = _blocks(problem, here.rows, weighting.outlines)
     m = marginalise(blocks, weighting.pose_root, weighting.factor)
     xi = pose_errors(blocks, m, np.zeros(problem.size), weighting.factor)
@@ -278,7 +278,7 @@ def _result(s: Solution, stations: NDArray[np.int64], cost: Cost) -> Registratio
 
 
 def _residuals(s: Solution, given_px: Array) -> tuple[OutlineResidual, ...]:
-    """The outlines' residuals; excluded ones with their reason. `given_px` (O,) is with the camera poses as given."""
+    """List outlines' residuals; excluded ones with a reason. `given_px` (O,) is with the camera poses as given."""
     problem = s.problem
     own = s.linearised.r + np.einsum("okj,oj->ok", s.linearised.A, s.state.poses[problem.image])
     refined_px, keep = rms_px(problem, own), s.weights > 0
@@ -305,7 +305,7 @@ def _cameras_in_scan(s: Solution, stations: NDArray[np.int64], *, refined: bool)
 
 
 def _components(s: Solution) -> dict[str, Array]:
-    """(n, n) parts of the common unknowns' covariance by source, from each source's share of the information."""
+    """Return (n, n) parts of the common unknowns' covariance by source, from each one's share of the information."""
     outline, pose = outline_and_pose_shares(s.blocks, s.marginal, s.pose_root, s.outline_factor)
     prior, p = s.problem.prior(), s.problem
     spheres, common = np.zeros_like(prior), np.zeros_like(prior)
@@ -318,7 +318,7 @@ def _components(s: Solution) -> dict[str, Array]:
 
 
 def _starting_state(problem: Problem, assignments: Sequence[Assignment], images: PosedImages) -> State:
-    """Initial bases and scale from the assignments' poses: the mean of the half of each station's images that agree.
+    """Return initial bases and scale by the assignments' poses: means of the half of a station's images that agree.
 
     Raises:
         ComputeError: a station has no image with a pose, or the poses do not determine the scale.
@@ -355,7 +355,7 @@ def _starting_state(problem: Problem, assignments: Sequence[Assignment], images:
 
 
 def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> float:
-    """Initial scale from the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
+    """Return the initial scale by the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
     middle = problem.centres.mean(axis=0)
     upper, lower = 0.0, 0.0
     for g in problem.groups:
@@ -411,7 +411,7 @@ def free_poses(n_images: int) -> PoseNoise:
 
 
 def unknown_pose_noise(n_images: int) -> PoseNoise:
-    """Isotropic noise of position and of orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
+    """Return isotropic noise of position and orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
     parts = np.zeros((2, n_images, 6, 6))
     parts[0, :, :3, :3] = 1e-4 * np.eye(3)
     parts[1, :, 3:, 3:] = 1e-4 * np.eye(3)

@@ -66,7 +66,7 @@ class SfmModel:
         return self.tracks.points
 
     def joint_pose_covariance(self, known: CameraCovariance | None = None) -> Array:
-        """(6 N, 6 N) covariance of the poses after a similarity has aligned their positions; in the model's unit.
+        """Return (6 N, 6 N) covariance of poses after a similarity has aligned their positions; the model's unit.
 
         Increments (d, w) of exp(w) R, t + d in the model's axes. `known` is the covariance of a camera that was
         fixed. Takes about a second.

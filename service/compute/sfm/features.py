@@ -95,7 +95,7 @@ class PairMatches:
 
 
 def pack_matches(matches: Sequence[PairMatches]) -> bytes:
-    """Return matches of any number of pairs as a NumPy archive (.npz), sorted by pair, whatever the given order."""
+    """Pack matches of any number of pairs into a NumPy archive (.npz), sorted by pair, whatever the given order."""
     ordered = sorted(matches, key=lambda m: m.pair)
     buffer = io.BytesIO()
     np.savez_compressed(
@@ -130,7 +130,7 @@ def unpack_matches(data: bytes) -> list[PairMatches]:
 
 
 def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """(m, 2) indices of descriptors (n, 128) and (k, 128) that are mutual nearest neighbours and pass the ratio test.
+    """Return indices (m, 2) of descriptors (n, 128) and (k, 128) that are mutual nearest and pass the ratio test.
 
     Products of unsigned bytes are integers below 2^24, which single precision adds exactly in any order: the same
     descriptors give the same matches on every machine.

@@ -95,7 +95,7 @@ class FrontEnd:
         return self._extracted(self._children[0], file)
 
     def extract_all(self, files: Mapping[str, Path], progress: Progress | None = None) -> dict[str, ImageFeatures]:
-        """Return features of several images by name, in parallel; `progress` is called with ("extract", done, total).
+        """Extract features of images by name, in parallel; `progress` is called with ("extract", done, total).
 
         Raises:
             DataError, ComputeError: as `extract_features`; the message names the image.
@@ -116,7 +116,7 @@ class FrontEnd:
         pairs: Iterable[tuple[str, str]],
         progress: Progress | None = None,
     ) -> list[PairMatches]:
-        """Verified matches of each pair of names, sorted by pair; `progress` is called with ("match", done, total).
+        """Match each pair of names and verify it, sorted by pair; `progress` is called with ("match", done, total).
 
         A pair is matched in the order of its names, so (a, b) and (b, a) give the same result.
 
@@ -202,7 +202,7 @@ class CachedFrontEnd:
     def features(
         self, files: Mapping[str, Path], front: FrontEnd, progress: Progress | None
     ) -> dict[str, ImageFeatures]:
-        """Features of every image; those in the workspace are used if file, camera and settings are the same."""
+        """Return features of every image; stored ones are used if file, camera and settings are the same."""
         folder = self.workspace / "features"
         folder.mkdir(exist_ok=True)
         kept = {name: folder / f"{_key(file, self.camera, self.settings)}.npz" for name, file in files.items()}

@@ -141,7 +141,7 @@ def pairs_of(
     *,
     stations: Mapping[str, str] | None = None,
 ) -> list[tuple[str, str]]:
-    """Pairs of names worth matching (see `choose_pairs`): a function only of the set of images and their poses.
+    """Return pairs of names worth matching (see `choose_pairs`); they depend only on the set of images and poses.
 
     Before the images are taken, the planned poses give the pairs with which matching can begin; at the end, the pairs
     of the images that were taken are the ones used.

@@ -35,7 +35,7 @@ class TrackedFeatures:
     count: int
 
     def kept(self, observations: NDArray[np.bool_], least: int = 2) -> tuple[TrackedFeatures, Index]:
-        """The selected observations of tracks that still have at least `least` of them, and these tracks' numbers."""
+        """Select observations of tracks that still have `least` of them or more; return these tracks' numbers too."""
         length = np.bincount(self.track[observations], minlength=self.count)
         tracks = np.flatnonzero(length >= least)
         number = np.full(self.count, -1, dtype=np.int64)
@@ -162,7 +162,7 @@ def triangulate(poses: Array, plane: Array, sightings: TrackedFeatures, sigma: f
 
 
 def reprojection(poses: Array, points: Array, plane: Array, sightings: TrackedFeatures) -> tuple[Array, Array, Array]:
-    """Length (O,) and components (O, 2) of the reprojection errors, and their derivatives (O, 2, 3) by the points."""
+    """Return reprojection errors' length (O,) and components (O, 2), and derivatives (O, 2, 3) by the points."""
     R = poses[sightings.image, :3, :3]
     c = np.einsum("oji,oj->oi", R, points[sightings.track] - poses[sightings.image, :3, 3])
     front = c[:, 2] > 1e-9

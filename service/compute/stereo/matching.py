@@ -47,7 +47,7 @@ class DepthMap:
 
 
 def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
-    """Depth of the left image of a pair that looks at an object at this distance; None if too little agrees.
+    """Return the depth of a pair's left image of an object at this distance; None if too little agrees.
 
     The range of disparities is found in small images first. The weight of a depth is the square of the change of
     disparity (px) per metre of depth at the object: the inverse variance, up to the variance of the matching.

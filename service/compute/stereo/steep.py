@@ -286,7 +286,7 @@ class Photograph:
     nearest: Floats = field(repr=False)
 
     def seen(self, points_m: Array) -> tuple[Array, Array, Ints, NDArray[np.bool_]]:
-        """Pixels (..., 2), depth, place in the known depths (..., 2) and whether in the image, of points (..., 3)."""
+        """Project points (..., 3): pixels (..., 2), depth, place in the known depths (..., 2), if in the image."""
         camera = apply(inverse(self.view.T_world_camera), points_m.reshape(-1, 3)).reshape(points_m.shape)
         of = self.view.camera
         z = np.maximum(camera[..., 2], 1e-9)
@@ -361,7 +361,7 @@ def _best_views_at_once(photographs: Sequence[Photograph], points_m: Array, norm
 
 
 def _parallax(slants: Array, one: Array, cosines: Array) -> Array:
-    """(N, K) how far apart two views see a place, in lengths of the surface as they show it, for a unit move."""
+    """Return (N, K) how far apart two views see a place, in lengths on the surface as they show it, per unit move."""
     apart = slants - one[:, None]
     steep = one / np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-9)
     along = np.einsum("nki,ni->nk", apart, steep)
@@ -372,7 +372,7 @@ def _parallax(slants: Array, one: Array, cosines: Array) -> Array:
 def evidence(
     photographs: Sequence[Photograph], points_m: Array, normals: Array, moves_m: Array, spacing_m: float
 ) -> tuple[Floats, Array]:
-    """How alike the photographs are, 0 to 1 (N, L), with each place moved along its normal; and the views' cosines.
+    """Return how alike the photographs are, 0 to 1 (N, L), with places moved along normals; and the views' cosines.
 
     It is the correlation of patches, averaged over pairs of views. A noise is added to each variance, so that patches
     without texture correlate little. It is 0 where fewer than two views see a place.

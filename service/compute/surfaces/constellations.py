@@ -238,7 +238,7 @@ def merge_parts(parts_m: Sequence[Array]) -> MergedParts:
 def _next(
     parts_m: Sequence[Array], poses: dict[int, Transform], members: list[dict[int, int]]
 ) -> tuple[int, Transform, tuple[tuple[int, int], ...]]:
-    """The part that shares most spheres with those that are placed: its pose, and the pairs (sphere, own index)."""
+    """Select the part that shares most spheres with those placed: its pose, and the pairs (sphere, own index)."""
     placed = np.array([_mean(sphere, parts_m, poses) for sphere in members])
     found: list[tuple[int, int, Transform, tuple[tuple[int, int], ...]]] = []
     failed: dict[int, ComputeError] = {}
@@ -378,7 +378,7 @@ def close_loop(
 def _against_others(
     a: Array, b: Array, C: Array, staying: NDArray[np.bool_], i: int, start: Transform
 ) -> tuple[Array, float, float]:
-    """Difference (3,) of sphere i from its prediction by the others, squared Mahalanobis length, and sigma."""
+    """Return the difference (3,) of sphere i from the others' prediction, squared Mahalanobis length, and sigma."""
     others = staying.copy()
     others[i] = False
     T, covariance = _weighted(a[others], b[others], C[others], start)
@@ -392,7 +392,7 @@ def _against_others(
 
 
 def _weighted(a: Array, b: Array, C: Array, start: Transform) -> tuple[Transform, Array]:
-    """Rigid T_a_b by generalised least squares, and its covariance (6, 6) of (t, w) at a's origin, outer frame."""
+    """Fit rigid T_a_b by generalised least squares, with covariance (6, 6) of (t, w) at a's origin, outer frame."""
     W = np.linalg.inv(C)
 
     def equations(T: Transform) -> tuple[Array, Array]:

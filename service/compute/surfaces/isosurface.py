@@ -79,7 +79,7 @@ def _range(volume_hu: NDArray[np.int16], depth: int) -> tuple[int, int]:
 def _slabs(
     volume_hu: NDArray[np.int16], level: float, depth: int
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
-    """Vertices (i, j, k) and faces slab by slab of `depth` slices, and which vertices lie where two slabs meet."""
+    """Return vertices (i, j, k) and faces slab by slab of `depth` slices, and which vertices lie where two meet."""
     found: list[tuple[int, NDArray[np.float32], NDArray[np.int32]]] = []
     seams: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
     last = volume_hu.shape[0] - 1

@@ -312,8 +312,8 @@ def _apart(a: SphereFit, b: SphereFit, radius: float) -> bool:
 
 
 def _oriented(fits: list[SphereFit], expected: int | None) -> list[SphereFit]:
-    """Spheres without dents: those with the majority's winding, unless only fits of either winding give the expected
-    number."""
+    """Select spheres without dents: those with the majority's winding, unless only fits of either winding give the
+    expected number."""
     outward = [f for f in fits if f.orientation > -_MIXED]
     inward = [f for f in fits if f.orientation < _MIXED]
     for choice in (outward, inward, fits):

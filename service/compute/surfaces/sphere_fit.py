@@ -99,7 +99,7 @@ def summed(group: IntArray, columns: list[Array], n: int) -> Array:
 
 
 def grid_keys(points: Array, low: Array, size: IntArray, cell: float) -> IntArray:
-    """Keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) that begins one cell before `low`."""
+    """Return keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) from one cell before `low`."""
     index = np.floor((points - low) / cell).astype(np.int64) + 1
     return (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
 
@@ -212,7 +212,7 @@ def fit_centre(
 
 
 def _step(surface: OrientedPoints, centre: Array, radius: float, band: Band) -> TukeyStep | None:
-    """Weighted Gauss–Newton step of the centre; None if too few samples lie in the band, or in too flat a cap."""
+    """Take a weighted Gauss–Newton step of the centre; None if too few samples lie in the band, or too flat a cap."""
     ray = surface.points - centre
     distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
     unit = ray / np.maximum(distance, 1e-300)[:, None]
@@ -345,8 +345,8 @@ def fit_sphere(samples: SphereSamples, start: Array, radius: float, band: float)
 
 
 def _tukey_gain(residual: Array, band: float, area: Array) -> float:
-    """Attenuation of weighted mean residuals: a shift of the surface moves the mean by the sum of the influence
-    function's slopes, not by that of the weights."""
+    """Return the attenuation of weighted mean residuals: a shift of the surface moves the mean by the sum of the
+    influence function's slopes, not by that of the weights."""
     inside = (np.abs(residual) < band) & (area > 0)
     x2 = (residual[inside] / band) ** 2
     weights = float(np.sum(area[inside] * (1 - x2) ** 2))
@@ -392,8 +392,8 @@ def _patches(u: Array, r: Array, w: Array) -> Patches:
 
 
 def coverage(u: Array) -> float:
-    """Fraction of the whole sphere covered by directions (N, 3): counted in cells of a cube's faces, so that neither
-    uneven density nor a duplicate shell matters."""
+    """Return the fraction of the whole sphere covered by directions (N, 3): counted in cells of a cube's faces, so
+    that neither uneven density nor a duplicate shell matters."""
     n = int(np.clip(np.sqrt(len(u) / 24), 2, 20))
     axis = np.abs(u).argmax(axis=1)
     rows = np.arange(len(u))
@@ -409,7 +409,7 @@ def coverage(u: Array) -> float:
 
 
 def sample_weights(points: Array, cell: float) -> Array:
-    """Return weights (N,) of points without faces: a cell of surface counts once, however many points are in it."""
+    """Weigh (N,) points without faces: a cell of surface counts once, however many points are in it."""
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     key = (index[:, 0] * (1 << 20) + index[:, 1]) * (1 << 20) + index[:, 2]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)

@@ -96,7 +96,7 @@ def _correlation(unit: Array, length: float) -> Array:
 
 
 def _spectrum(p: Patches, K: Array, length: float) -> tuple[Array, Array]:
-    """Eigenvalues of the correlated part relative to the white part among the contrasts, and the residuals there."""
+    """Return eigenvalues of the correlated relative to the white part among the contrasts, and residuals there."""
     white = K.T @ (K * p.white[:, None])
     shared = K.T @ (_correlation(p.unit, length) * float(np.mean(p.white))) @ K
     values, vectors = eigh(shared, white, check_finite=False)
@@ -106,8 +106,8 @@ def _spectrum(p: Patches, K: Array, length: float) -> tuple[Array, Array]:
 def centre_uncertainties(
     spheres: Sequence[Patches], radius_residuals: Sequence[float], radius: float
 ) -> tuple[CentreUncertainty, ...]:
-    """Covariances of the weighted known-radius fits; if the free radii deviate by more than noise explains, the
-    effect on the centres is added."""
+    """Compute covariances of the weighted known-radius fits; if the free radii deviate by more than noise explains,
+    the effect on the centres is added."""
     noise = estimate_noise(spheres)
     parts: list[tuple[Array, Array, float]] = []
     for p, scale in zip(spheres, noise.scale, strict=True):
