@@ -32,9 +32,9 @@ class ClassScore:
         auc: area under the curve of the pose error up to each of THRESHOLDS_DEG.
         precision: mean precision over the pairs at each of PRECISION_PX.
         epipolar_px: median over the pairs of their medians; infinite if most have no match.
-        matches: mean number.
+        matches: mean number of matches.
         scored: share of the matches with ground truth.
-        seconds: mean for a pair.
+        seconds: mean time for a pair.
     """
 
     name: str

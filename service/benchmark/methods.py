@@ -54,7 +54,7 @@ class Method:
         mesh: finds the mesh that the commands left. Raises DataError if there is none.
         to_world: transforms vertices (V, 3) of that mesh to the world frame, m; it may read the exported folder. Most
             methods' meshes are in the world frame already.
-        programs: looked for on the path.
+        programs: programs that are looked for on the path.
         variable: the environment variable with the folder of its source code; "" if it needs none.
         lacking: says what else is missing to run it on this machine; "" if nothing is.
     """

@@ -42,12 +42,12 @@ class Score(Record):
     """A mesh compared with the truth: the paper's Chamfer distance and what belongs to it.
 
     Attributes:
-        chamfer_mm: mean of the next two.
+        chamfer_mm: mean of accuracy and completeness.
         accuracy_mm, completeness_mm: mean distances from mesh to truth, and from truth to mesh.
         floor_mm: the `chamfer_mm` that sampling alone would give if both were equal.
         spacing_mm: distance between the samples.
-        f_score_05, f_score_10: at 0.5 mm and 1 mm.
-        normal_consistency: mean cosine between the normals, of both directions.
+        f_score_05, f_score_10: F-scores at 0.5 mm and 1 mm.
+        normal_consistency: mean cosine between the normals, averaged over both directions.
         outside_percent: share of the mesh's area that was cut off because it is outside the box of the truth.
         excluded_percent: share of the samples farther than 20 mm, which are in no mean.
         seen_percent: share of the truth within 1 mm of the mesh.
@@ -82,7 +82,7 @@ class BenchmarkResult(Record):
         mesh_sha256: SHA-256 of the method's own mesh file; "" if it made none.
         faces: number of faces of that mesh.
         score: None if the method made no mesh.
-        failure: why there is no mesh, in words.
+        failure: the reason why there is no mesh.
         machine: the machine on which it ran and was scored.
         finished_utc: time of its end, UTC.
     """

@@ -153,7 +153,7 @@ def run_trial(
     Args:
         trial: the run.
         whole: the data set, as `data_set_of_folder` reads it.
-        progress: called with what is being done.
+        progress: called with a text of what is being done.
 
     Raises:
         ConfigurationError: the method is not installed; what it reads has been exported, and the message has its

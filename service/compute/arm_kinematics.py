@@ -26,7 +26,7 @@ def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0
 
     Args:
         joints_rad: (N, J); only arms of J axes are considered.
-        T_base_flange: (N, 4, 4) as reported by the controller with the tool centre point at the flange.
+        T_base_flange: (N, 4, 4) poses as the controller reports them with the tool centre point at the flange.
         within_m: largest accepted median distance of the positions.
     """
     best, best_m = None, within_m
@@ -42,8 +42,8 @@ def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transf
     """Find the arm and its tool T_flange_tool with these poses; None if no known arm with one fixed tool has them.
 
     Args:
-        joints_rad: (N, J).
-        T_base_tool: (N, 4, 4) as reported by a controller with an active tool centre point.
+        joints_rad: (N, J) joint angles.
+        T_base_tool: (N, 4, 4) poses as a controller with an active tool centre point reports them.
     """
     best: tuple[float, ArmModel, Transform] | None = None
     for arm in (arm for arm in known_arms() if arm.axes == joints_rad.shape[1]):
@@ -96,7 +96,7 @@ def dh_jacobian(frames: Array) -> Array:
     The pose increment is (d in metres, w in radians) in the flange's axes, about its origin.
 
     Args:
-        frames: (N, J + 1, 4, 4) as from `chain`.
+        frames: (N, J + 1, 4, 4) frames from `chain`.
     """
     axes = frames.shape[1] - 1
     R_flange, flange = frames[:, -1, :3, :3], frames[:, -1, :3, 3]

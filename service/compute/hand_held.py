@@ -260,7 +260,8 @@ class AdjustedCapture:
     """The adjusted spheres and poses.
 
     Attributes:
-        spheres_m: (N, 3) in the frame in which they were given; a sphere seen in fewer than two images is unchanged.
+        spheres_m: (N, 3) centres in the frame in which they were given; a sphere seen in fewer than two images is
+            unchanged.
         known: numbers of the spheres seen in at least two images.
         sigma_m: standard deviation of the least certain of these against the others.
         poses: T_scene_camera by viewpoint.

@@ -89,7 +89,7 @@ def register_station(
 
     Args:
         views: any number of images with their outlines.
-        spheres_m: (M, 3) in the frame of the scan or the CT.
+        spheres_m: (M, 3) centres in the frame of the scan or the CT.
         T_base_scan: result of a registration of earlier images, by which spheres are identified; None: they are
             identified from scratch.
 

@@ -184,7 +184,7 @@ def register_images(
     """Identify, register and evaluate detected outlines.
 
     Args:
-        outlines: per image, from `locate_outlines` or `detect_all`.
+        outlines: the outlines of each image from `locate_outlines` or `detect_all`.
         images: camera, poses and names of the images. If the poses are not metric, their scale is estimated.
         spheres: registration spheres, and control spheres if there are any.
         settings: the settings of `register`.
@@ -192,8 +192,8 @@ def register_images(
             identified here.
         search: searches images for control spheres that are missing among the outlines; None: they count as not
             measured.
-        lens_covariance: (8, 8) of the calibration, which adds the component INTRINSICS to the covariance.
-        calibrated: (8, 8) of the calibration, with which the check compares; None: `lens_covariance`.
+        lens_covariance: (8, 8) covariance of the calibration, which adds the component INTRINSICS to the covariance.
+        calibrated: (8, 8) covariance of the calibration with which the check compares; None: `lens_covariance`.
         check: true to look for contradictions: images that contradict the others are left out, and what the model
             does not explain adds the component UNEXPLAINED.
 

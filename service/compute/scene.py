@@ -63,7 +63,7 @@ class ScanSpheres:
         centres_m: (M, 3) registration spheres.
         radius_m: radius of all spheres.
         control_m: (C, 3) control spheres, which only the evaluation uses.
-        covariance_m2: (M, 3, 3) of the registration spheres' centres; None takes them as exact.
+        covariance_m2: (M, 3, 3) covariance of the registration spheres' centres; None takes them as exact.
     """
 
     centres_m: Array = field(repr=False)

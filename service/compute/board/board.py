@@ -45,8 +45,8 @@ class Board:
         dictionary: OpenCV's name for the dictionary of a ChArUco board's markers.
         legacy: a ChArUco board as OpenCV printed it before 4.6 (differs if the number of squares in a column is
             even).
-        size_tolerance: largest relative error of `square_m`, as the maker states it.
-        flatness_m: largest bow of the board, as the maker states it; 0: exactly flat.
+        size_tolerance: largest relative error of `square_m`, as given by the maker.
+        flatness_m: largest bow of the board, as given by the maker; 0: exactly flat.
         bow_m: how far the board's middle lies behind its sides, and behind its ends, in metres: the rise of an arc
             along the columns and of one along the rows; negative if the middle comes towards the camera.
     """

@@ -58,8 +58,8 @@ class BoardKnowledge:
     """The estimates from which board poses are planned, with their tolerances.
 
     Attributes:
-        camera: nominal, or calibrated.
-        T_flange_camera, T_base_board: nominal, or estimated from the images.
+        camera: the nominal camera, or the calibrated one.
+        T_flange_camera, T_base_board: the nominal poses, or those estimated from the images.
         spread: (12, 12); the possible increments (d, w) of T_flange_camera and T_base_board are spread @ u for every
             u within ± 1.
         focal: relative tolerance of the focal length.
@@ -103,7 +103,7 @@ def nominal_knowledge(
     """Return the knowledge before any image.
 
     Args:
-        camera: nominal, for the images' size.
+        camera: the nominal camera, for the images' size.
         T_flange_camera: the camera's pose on the flange by the mount's drawing.
         middle_m: (3,) intended place of the board's middle, base frame.
         approach: (3,) horizontal unit vector from the scene towards the base.
@@ -136,14 +136,14 @@ def refined_knowledge(
     prior; the arm's error is taken as about a millimetre.
 
     Args:
-            known: nominal, or from calibrations so far.
-            views: (N) of the board, N > 0.
-            T_base_flange: (N, 4, 4).
-            board: the board in the views.
-            lens_known: whether the camera is calibrated and stays as it is.
+        known: the nominal knowledge, or that of calibrations so far.
+        views: (N) views of the board, N > 0.
+        T_base_flange: (N, 4, 4) poses of the flange.
+        board: the board in the views.
+        lens_known: true if the camera is calibrated and stays as it is.
 
-        Returns:
-            The knowledge, and T_camera_board (N, 4, 4) of the views.
+    Returns:
+        The knowledge, and T_camera_board (N, 4, 4) of the views.
 
     Raises:
         DataError: there is no view.

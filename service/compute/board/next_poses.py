@@ -36,7 +36,7 @@ class SuggestedPose:
         T_base_flange: target pose of the flange.
         T_base_camera: the camera's pose there.
         sigma_mm: predicted standard deviation of T_flange_camera's translation after this and all poses before it.
-        sigma_deg: the same for its rotation.
+        sigma_deg: standard deviation of its rotation.
     """
 
     T_base_flange: Transform
@@ -137,11 +137,11 @@ class _Model:
     """The linearised measurement of a board pose.
 
     Attributes:
-        T_flange_camera, T_base_board: by the calibration so far.
-        points_m: (P, 3) of the board.
-        camera: calibrated.
+        T_flange_camera, T_base_board: the poses by the calibration so far.
+        points_m: (P, 3) the board's points.
+        camera: the calibrated camera.
         corner_sigma_px: standard deviation of a corner.
-        robot_covariance: (6, 6) of a flange pose, m² and rad².
+        robot_covariance: (6, 6) covariance of a flange pose, m² and rad².
     """
 
     T_flange_camera: Transform

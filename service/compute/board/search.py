@@ -44,7 +44,7 @@ class UsableViews:
     Attributes:
         size: common width and height, px.
         indices: (N) indices of the images.
-        views: (N).
+        views: (N) the views.
         excluded: reason by image index.
     """
 
@@ -224,11 +224,11 @@ def with_parts(
     """Search images without a whole board for parts of it; where that fails, the reason says why.
 
     Args:
-        images: (N) from `find_boards`.
+        images: (N) results of `find_boards`.
         greys: (N) pixels of the images without a view; None for the others.
         board: a checkerboard.
         known: camera, mount and board as the images with a view show them.
-        T_base_flange: (N, 4, 4).
+        T_base_flange: (N, 4, 4) poses of the flange.
     """
     out: list[BoardImage] = []
     for image, grey, flange in zip(images, greys, T_base_flange, strict=True):

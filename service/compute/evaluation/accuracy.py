@@ -82,8 +82,8 @@ def evaluate(
     """Compute the errors of spheres that were not used in the registration.
 
     Args:
-        outlines: per image.
-        assignments: per image, outline → index into the control spheres' centres.
+        outlines: the outlines of each image.
+        assignments: outline → index into the control spheres' centres, for each image.
         images: the camera, and registered poses T_scan_camera, metric.
         controls: the control spheres as `centres_m`, with their covariance.
         registration: predicts the errors; its covariance gives `sigma_mm` and `normalised`. The poses must be its

@@ -40,8 +40,8 @@ class ControlSphere:
         index: its index in the list of control spheres.
         expected: number of images that should show it.
         measured: number of images in which it was measured.
-        radial_error_mm: mean over its outlines; None if it was not measured.
-        reprojection_error_px: mean over its outlines.
+        radial_error_mm: mean radial error over its outlines; None if it was not measured.
+        reprojection_error_px: mean reprojection error over its outlines.
         displacement_mm: distance from where scan and registration put it to where the images see it; None below three
             images.
         displacement_sigma_mm: standard deviation of the displacement, as far as the outlines determine it.
@@ -125,8 +125,8 @@ def evaluate_controls(
     """Find the control spheres in registered images and evaluate the registration by them.
 
     Args:
-        outlines: per image, as the registration had them.
-        taken: per image, outlines that are registration spheres.
+        outlines: the registration's outlines of each image.
+        taken: the outlines of each image that are registration spheres.
         images: the images with T_scan_camera, metric; NaN for images without a pose, which count as if they were not
             there.
         spheres: registration and control spheres, scan frame.

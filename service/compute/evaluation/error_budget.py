@@ -72,8 +72,8 @@ def locate_in_images(
     others of their sphere are excluded. The covariance follows from the outlines', inflated if they scatter more.
 
     Args:
-        outlines: per image.
-        assignments: per image, outline → index into `starts_scan_m`.
+        outlines: the outlines of each image.
+        assignments: outline → index into `starts_scan_m`, for each image.
         T_scan_camera: (N, 4, 4), metric.
         starts_scan_m: (M, 3) approximate centres.
         radius_m: radius of the spheres.

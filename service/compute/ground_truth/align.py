@@ -55,7 +55,7 @@ class DistanceChange:
 
     Attributes:
         worst: the two spheres whose distance changed most.
-        worst_m: that change, without its sign: what the gate judges.
+        worst_m: size of that change, which the gate judges.
         rms_m: root mean square of all changes.
     """
 
@@ -70,7 +70,7 @@ def distance_changes(before_m: Array, after_m: Array, pairs: Sequence[tuple[int,
     Args:
         before_m: (M, 3) centres in one frame.
         after_m: (N, 3) centres in another.
-        pairs: (index before, index after) of the spheres that both hold.
+        pairs: (index before, index after) of the spheres in both.
 
     Raises:
         ComputeError: fewer than two common spheres.
@@ -103,7 +103,7 @@ class Aligned:
 
     Attributes:
         T_scan_ct: (4, 4) by the spheres that did not move.
-        covariance: (6, 6) of T_scan_ct, as in `evaluation.closure.Alignment`.
+        covariance: (6, 6) covariance of T_scan_ct, as in `evaluation.closure.Alignment`.
         loop: the spheres one by one.
         distances: their distances before (CT) and after (scan) the transport.
         only_ct: spheres, by their numbers in the CT, that are missing in the scan.

@@ -26,7 +26,7 @@ class Samples:
     """Points on a surface.
 
     Attributes:
-        points_m: (N, 3).
+        points_m: (N, 3) the samples' places.
         origin: (N,) index of the face that each point lies on, or of the cloud's point.
         normals: (N, 3) unit normals; None for a cloud without.
     """
@@ -251,7 +251,7 @@ class Direction:
     Attributes:
         n: samples whose distances were measured, MOST_COMPARED at most.
         excluded: number of these farther than the outlier limit; in no mean, but in the denominator of `within`.
-        mean_m: mean distance to the nearest sample of the other surface: the paper's figure.
+        mean_m: mean distance to the nearest sample of the other surface, which the paper reports.
         median_m, p95_m: median and 95th percentile of the same distances.
         within: share of all samples that have the other surface within each threshold.
         floor_m: mean distance from a random place of the other surface to its own nearest sample: what `mean_m`
@@ -290,8 +290,8 @@ class ChamferScore:
         gt_to_pred: completeness: from the truth to the surface judged.
         thresholds_m: distance thresholds of the F-score.
         pred, gt: the samples with their distances.
-        vertex_distance_m: (V,) from the vertices of the surface judged to the samples of the truth, infinite beyond
-            the limit; None if not asked for.
+        vertex_distance_m: (V,) distances from the vertices of the surface judged to the samples of the truth,
+            infinite beyond the limit; None if not asked for.
     """
 
     pred_to_gt: Direction

@@ -60,8 +60,9 @@ class NearestOfBlocks:
     """The nearest of many points that are shown block by block, so that never all of them are in memory.
 
     Attributes:
-        distance_m: (Q,) from each query to the nearest point shown so far; infinite if none is within the limit.
-        label: (Q,) of that point; -1 if there is none.
+        distance_m: (Q,) distance from each query to the nearest point shown so far; infinite if none is within the
+            limit.
+        label: (Q,) label of that point; -1 if there is none.
     """
 
     def __init__(self, queries_m: Array, within_m: float = np.inf) -> None:
@@ -213,7 +214,7 @@ class TriangleTree:
         """Find the point of the surface nearest to each query (Q, 3).
 
         Args:
-            queries_m: (Q, 3).
+            queries_m: (Q, 3) the queries' places.
             bounds_m: (Q,) distances from each query to some place of the surface, such as a sample of it. The
                 closer these are to the answer, the faster it is found; None: found by descending the tree.
         """

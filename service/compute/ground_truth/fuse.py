@@ -219,7 +219,8 @@ class FusionSettings:
     Attributes:
         blend_m: width of the overlap over which the weight rises.
         sigma_ct_m, sigma_scan_m: least standard deviation of each surface along its normal, as of its spheres.
-        alignment_covariance: (6, 6) of T_scan_ct as in `evaluation.closure.Alignment`; None: known exactly.
+        alignment_covariance: (6, 6) covariance of T_scan_ct as in `evaluation.closure.Alignment`; None: known
+            exactly.
         keep_scan_only: true to add parts of the scan that are missing in the CT, unconnected.
         least_part_m2: smaller unconnected parts of the CT are left out.
         overlap, wound: limits.
@@ -246,7 +247,7 @@ class Fused:
         source: (V,) the Source of each vertex.
         weight: (V,) weight of the scan, 0 to 1.
         sigma_m: (V,) standard deviation along the normal.
-        wound: (V,) in the wound region, as proposed and corrected.
+        wound: (V,) true in the wound region, as proposed and corrected.
         ct_offset_m: median height of the CT above the scan, outside the wound: its bias if the scan is right.
         ct_spread_m: robust standard deviation of the same heights.
         folded: number of faces that could not be prevented from turning over when their vertices moved.

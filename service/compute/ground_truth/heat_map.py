@@ -263,7 +263,7 @@ def fusion_picture(ct: Surface, scan: Surface, score: ChamferScore, scale: HeatS
     """Draw a PNG with CT and scan by their distances, and the fused mesh by its sources, seen along one direction.
 
     Args:
-        ct, scan: as they were compared, in one frame.
+        ct, scan: the surfaces as they were compared, in one frame.
         score: the result of the comparison.
         scale: the scale of its colours.
         fused: the fusion of both.

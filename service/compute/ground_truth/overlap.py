@@ -117,8 +117,8 @@ class WoundLimits:
     Attributes:
         closing_m: uncovered places nearer than twice this to one another are one, with what lies between.
         least_area_m2: least area of its surface.
-        least_depth_m: mean depth below the rim.
-        least_facing: mean cosine between its normals and up, so that undersides and sides are none.
+        least_depth_m: least mean depth below the rim.
+        least_facing: least mean cosine between its normals and up, so that undersides and sides are none.
     """
 
     closing_m: float = 0.003
@@ -324,7 +324,7 @@ def seen_along(corners_m: Array, along: Array, depth_m: tuple[float, float]) -> 
     Args:
         corners_m: (K, 3) corners in order around the polygon.
         along: (3,) direction from the surface towards the viewer.
-        depth_m: how far it reaches below the lowest corner (negative) and above the highest one.
+        depth_m: distances by which it reaches below the lowest corner (negative) and above the highest one.
 
     Raises:
         DataError: fewer than three corners, or no direction.

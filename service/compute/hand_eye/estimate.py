@@ -70,17 +70,17 @@ class HandEyeAnswer:
         T_base_board: the board's pose.
         sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
         sigma_deg: bootstrap standard deviation of the rotation.
-        covariance: (6, 6) of T_flange_camera from the bootstrap, (d in metres, w in radians) in the flange's axes,
-            including `camera_share`.
+        covariance: (6, 6) covariance of T_flange_camera from the bootstrap, (d in metres, w in radians) in the
+            flange's axes, including `camera_share`.
         camera_share: (6, 6) part of it due to the camera calibration's uncertainty, which more images do not reduce.
         formal_covariance: (6, 6) predicted by the fit's own noise model; None unless the method is weighted.
         robot_noise_mm: standard deviation per axis of the robot's remaining position error; None unless the method is
             weighted.
-        robot_noise_deg: the same for its rotation.
+        robot_noise_deg: standard deviation of its orientation error; None unless the method is weighted.
         residual_mm: (N,) distance between the board as placed by each view and T_base_board, at the board's middle.
-        residual_deg: (N,) the same for its orientation.
-        held_out_mm: (N,) as residual_mm, but each view is judged by a calibration without its fold.
-        held_out_deg: (N,) the same for its orientation.
+        residual_deg: (N,) angle between the two.
+        held_out_mm: (N,) distance like residual_mm, but each view is judged by a calibration without its fold.
+        held_out_deg: (N,) angle like residual_deg, judged in the same way.
     """
 
     T_flange_camera: Transform
@@ -122,7 +122,7 @@ class HandEyeResult(HandEyeAnswer):
         methods: T_flange_camera by every method that gave an answer.
         spread_mm: largest distance between the chosen method's translation and another's (including Tsai's and
             Andreff's, which are the weakest: a large spread warns of weak data).
-        spread_deg: the same for the rotation.
+        spread_deg: largest angle between the chosen method's rotation and another's.
         corner_sigma_px: standard deviation of the corners; None if only board poses were given.
         rotation_spread_deg: largest rotation between two views.
         second_axis_deg: root mean square rotation about the second best axis.
@@ -164,8 +164,8 @@ class HandEyeViews:
     """N views of a board, as measured.
 
     Attributes:
-        T_base_flange: (N, 4, 4) from the robot.
-        T_camera_board: (N, 4, 4) from the images.
+        T_base_flange: (N, 4, 4) flange poses by the robot.
+        T_camera_board: (N, 4, 4) board poses by the images.
         corners: the boards' corners, from which the board poses' covariance follows; required by `reprojection`.
         joints_rad: (N, J) joints as recorded with the poses.
         arm: the arm's model, with `joints_rad`.

@@ -24,9 +24,9 @@ class BoardCorners:
     """Detected corners of N board views.
 
     Attributes:
-        points_m: (P, 3) in the board frame.
+        points_m: (P, 3) points in the board frame.
         corners_px: (N, P, 2) detected; NaN for corners that were not seen.
-        camera: calibrated.
+        camera: the calibrated camera.
     """
 
     points_m: Array

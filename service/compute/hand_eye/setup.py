@@ -264,10 +264,10 @@ class PosesAsRead:
     """The robot's poses in the file from which they were read.
 
     Attributes:
-        hands: (M, 4, 4) of all rows in the file's order, as they were read.
+        hands: (M, 4, 4) poses of all rows in the file's order, as they were read.
         rows: (N,) the row of each view.
         images: (N) their names.
-        readings: how else the file could be read.
+        readings: the other ways to read the file.
     """
 
     hands: Array

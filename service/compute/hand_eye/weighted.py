@@ -50,13 +50,13 @@ class BoardViews:
     """Measurements of N board views.
 
     Attributes:
-        T_base_flange: (N, 4, 4) as reported, corrected by the arm's parameters `about`.
-        T_camera_board: (N, 4, 4) from the images.
-        covariance: (N, 6, 6) of T_camera_board: (d, w) in the camera's axes.
+        T_base_flange: (N, 4, 4) poses as reported, corrected by the arm's parameters `about`.
+        T_camera_board: (N, 4, 4) poses by the images.
+        covariance: (N, 6, 6) covariance of T_camera_board: (d, w) in the camera's axes.
         design: (N, 6, K) derivative of the flange's increment by the arm's parameters; K may be 0.
         kind: (K,) index into `Noise.scales` of each parameter's prior scale.
         about: (K,) the arm's parameters at which `design` is the derivative.
-        size_sigma: relative standard deviation of the board's stated size.
+        size_sigma: relative standard deviation of the board's given size.
         scales_weight: the scales of the geometry are known to be about 1 as if that many parameters showed it: few
             images show few lengths, and a scale of these alone would vanish where they are right by chance.
     """

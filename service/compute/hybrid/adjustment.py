@@ -39,7 +39,7 @@ class BundleSolution:
         state: the adjusted cameras, points, bases and camera model.
         sigmas: the estimated sigmas of the components.
         weights: robust weight of each measurement, by component.
-        covariance: (n, n) of the frame parameters, points eliminated.
+        covariance: (n, n) covariance of the frame parameters, points eliminated.
         chi2: reduced chi square of each component, with robust weights and its own redundancy.
         steps: number of linearisations.
     """

@@ -96,8 +96,8 @@ class HybridOptions:
         robot_sigma_m: initial sigma of the robot's positions; estimated from the data.
         robot_sigma_rad: initial sigma of its orientations; estimated from the data.
         track_sigma_px: initial sigma of the tracks; estimated from the data.
-        lens_covariance: (4, 4) of the calibrated fx, fy, cx, cy, to refine them with the calibration as a prior;
-            None: the camera is fixed.
+        lens_covariance: (4, 4) covariance of the calibrated fx, fy, cx, cy, to refine them with the calibration as a
+            prior; None: the camera is fixed.
     """
 
     sphere_sigma_m: float = 5e-6
@@ -132,7 +132,7 @@ class HybridPoses:
         chi2: reduced chi square of each component: tracks, spheres, centres, robot_position, robot_rotation, lens.
         registration: the registration of the scan to the poses of structure from motion, from which the adjustment
             started.
-        centre_scan_m: (3,) mean of the spheres.
+        centre_scan_m: (3,) mean of the spheres' centres.
     """
 
     T_scan_camera: Array
@@ -220,7 +220,7 @@ def hybrid_poses(
         images: the images with poses from structure from motion, in any frame and scale, and the camera by which the
             outlines were made. Their stations are those of the robot.
         tracks: tracks of the same model.
-        outlines: per image, from the detector.
+        outlines: the detector's outlines of each image.
         spheres: the registration spheres; without a covariance, options.sphere_sigma_m.
         T_base_camera: (N, 4, 4) poses by the robot and the hand-eye calibration, each in its station's base frame;
             NaN for images without a robot pose. None: only the spheres give the metric frame.

@@ -269,7 +269,7 @@ class Shift:
     """The shift of a second picture's content against the first, in x and y, over the parts that show one.
 
     Attributes:
-        median_px: median over all parts; what is at p in the first is at p + shift in the second.
+        median_px: median shift over all parts; what is at p in the first is at p + shift in the second.
         largest_px: length of the largest shift of a part.
         parts: number of parts that show a shift.
     """

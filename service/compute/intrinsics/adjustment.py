@@ -38,7 +38,7 @@ class BoardSurface:
     """The points of a board that may be bent.
 
     Attributes:
-        points: (K, 3) of the flat board, m.
+        points: (K, 3) points of the flat board, m.
         bends: (K, S) displacement along z of each point by a unit of each term; S is 0 for a board that is flat.
         sigma_m: standard deviation of each term, before any image.
     """

@@ -56,17 +56,17 @@ class IntrinsicsResult:
         rms_px: root mean square of all corners' reprojection errors (two-dimensional).
         views: (N,) input indices of the views used.
         corners: (N) their corners.
-        per_view_rms_px: (N,) the same for each view.
+        per_view_rms_px: (N,) root mean square for each view.
         parameters: (P) names, in the order of the covariance.
         covariance: (P, P), px and 1: from the corners' noise, estimated from the residuals, times `inflation`.
-        joint_covariance: (P + S, P + S) of the parameters and the S terms of the board's bow (m); S is 0 for a
-            board that is stated to be exactly flat.
+        joint_covariance: (P + S, P + S) covariance of the parameters and the S terms of the board's bow (m); S is 0
+            for a board that is exactly flat by its description.
         inflation: ratio of the variance to that from independent corners, at least 1. The corners of one image share
             errors (light, flatness of the board, lens model); the disagreement between images shows how large these
             are.
         sigma: standard deviation of each parameter, the roots of the covariance's diagonal.
-        sigma_independent: the same from corner noise alone, as most programs report it.
-        sigma_by_image: the same from the disagreement of the images alone; NaN for fewer than 6 views.
+        sigma_independent: standard deviations from corner noise alone, as most programs report them.
+        sigma_by_image: standard deviations from the disagreement of the images alone; NaN for fewer than 6 views.
         leave_one_out: (N, P) change of the parameters when one view is left out (one Newton step).
         sigma_corner_px: standard deviation of one coordinate of a corner, from the residuals.
         T_camera_board: (N, 4, 4); board frame: x along the columns, y along the rows, z away from the camera.

@@ -26,12 +26,12 @@ class ProjectionUncertainty:
         distance_m: distance of the points along the optical axis.
         pixels: (rows, columns, 2) positions of the grid.
         sigma_px: (rows, columns) standard deviation.
-        sigma_mm: (rows, columns) the same at that distance, perpendicular to the line of sight.
+        sigma_mm: (rows, columns) standard deviation at that distance, perpendicular to the line of sight.
         centre_px: standard deviation at the middle of the image.
-        worst_px: largest over the image.
+        worst_px: largest standard deviation over the image.
         rms_px: root mean square over the image.
         centre_mm: standard deviation at the middle of the image.
-        worst_mm: largest over the image.
+        worst_mm: largest standard deviation over the image.
         rms_mm: root mean square over the image.
     """
 

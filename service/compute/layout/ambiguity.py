@@ -69,7 +69,7 @@ class LayoutReport:
 
     Attributes:
         margin: least misfit of any wrong assignment of any four spheres; noise must stay well below it.
-        margin_of_five: the same of five spheres; infinite if none was found.
+        margin_of_five: least misfit of any wrong assignment of any five spheres; infinite if none was found.
         worst: the assignments with the least misfit, least first.
         margin_by_count_m: least misfit by number of visible spheres (4, 5, … all).
         sphere_margins_m: (N,) least misfit of the assignments that mistake this sphere for another.

@@ -60,7 +60,7 @@ def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: In
     distribution with these two moments gives the bounds. Source: Satterthwaite (1946), for a non-central sum.
 
     Args:
-        centres: (N, 3).
+        centres: (N, 3) the spheres' centres.
         covariance: (3N, 3N) m².
         seen, taken: indices of the spheres and of those they are mistaken for.
     """

@@ -94,7 +94,7 @@ class AdjustedLayout:
     """The adjusted spheres and poses.
 
     Attributes:
-        centres_m: (N, 3) in the frame of the first photograph.
+        centres_m: (N, 3) centres in the frame of the first photograph.
         covariance: (3N, 3N) m² of all centres jointly, including the camera's uncertainty.
         T_photo_first: the map from the first photograph's frame to each photograph's own.
         chi2: chi square per degree of freedom; if above 1, the covariance is scaled by it.

@@ -35,7 +35,7 @@ class PhotoLayout:
     """The spheres of all photographs in one frame.
 
     Attributes:
-        centres_m: (N, 3) in the frame of the leading photograph.
+        centres_m: (N, 3) centres in the frame of the leading photograph.
         covariance: (3N, 3N) m² of all centres jointly.
         spheres: the sphere of each of a photograph's outlines (-1: none), for every photograph; an empty array if the
             photograph could not be used.

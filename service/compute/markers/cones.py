@@ -261,10 +261,10 @@ def fit_pose(
 
     Args:
         cones: N ≥ 3.
-        centres_m: (N, 3) of the spheres, scan frame.
+        centres_m: (N, 3) centres of the spheres, scan frame.
         radius_m: radius of the spheres.
         start: initial T_camera_scan.
-        iterations: largest number.
+        iterations: largest number of iterations.
     """
     seen = ObservedCones.with_chords(cones.axes, cones.half_angles)
     try:

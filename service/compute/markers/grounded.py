@@ -268,7 +268,7 @@ def _sphere_masks(
     (paper, "Sphere Segmentation").
 
     Args:
-        image_bgr: (H, W, 3).
+        image_bgr: (H, W, 3) the image.
         boxes: boxes with a margin around the sphere.
         networks: the networks of SAM 2.
     """

@@ -146,9 +146,9 @@ class _BeforeBlur:
     """The model before interpolation and the colours' blur.
 
     Attributes:
-        mixed: (G, 3, 6, K, J') of Y, Cb, Cr: derivatives by limb, inner and outer slope, offset and blur; the value.
-        slope: (G, 3, K, J') of the coded values by linear light, of B, G, R.
-        share: (G, K, J') of the sphere in each sample.
+        mixed: (G, 3, 6, K, J') Y, Cb, Cr: derivatives by limb, inner and outer slope, offset and blur; the value.
+        slope: (G, 3, K, J') derivative of the coded values by linear light, for B, G, R.
+        share: (G, K, J') share of the sphere in each sample.
     """
 
     mixed: Array32
@@ -199,7 +199,7 @@ def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32
 
     Args:
         u: (G, K, J') distances from the edge, positive outside.
-        x: the same in standard deviations of the blur, within ± 12.
+        x: the distance in standard deviations of the blur, within ± 12.
         s: (G, 1, 1) standard deviations of the blur.
         R: (G, 1, 1) radii of the outlines.
     """
@@ -287,7 +287,7 @@ def fit_limb(
         blur: (G,) initial standard deviation of lens and pixel.
         chroma_blur: (G,) initial extra standard deviation of the colour differences; about 1.1 for 4:2:0.
         iterations: number of Gauss–Newton steps.
-        reach: largest offset.
+        reach: largest offset of an edge.
     """
     inside = profiles.inside
     usable = np.where(inside.any(axis=1, keepdims=True), inside, True)

@@ -68,7 +68,7 @@ def detect_by_masks(
 
     Args:
         image_bgr: an image of the camera's size.
-        camera: used to undistort points before the conic is fitted.
+        camera: the camera by which points are undistorted before the conic is fitted.
         options: radii, coverage and number of points are used.
         boxes: boxes of another detector; None: they are found here.
     """

@@ -86,7 +86,8 @@ def relative_covariance(T_world_first: Transform, T_world_second: Transform, joi
     Args:
         T_world_first: pose of the first camera.
         T_world_second: pose of the second camera.
-        joint: (12, 12) of (d', w') of the first and (d, w) of the second pose, with their correlations, m and rad.
+        joint: (12, 12) covariance of (d', w') of the first and (d, w) of the second pose, with their correlations, m
+            and rad.
     """
     R = T_world_second[:3, :3]
     J = np.zeros((6, 12))
@@ -144,10 +145,10 @@ class ListedPair:
     Attributes:
         first, second: names, in order.
         overlap: share of the points of the first view that the second sees too, and of the second view's.
-        common_points: that both see.
+        common_points: number of points that both see.
         difficulty: its measures and class.
         T_second_first: (4, 4), m.
-        covariance: (6, 6) of it, as `relative_covariance`; None where the poses' own errors are not known.
+        covariance: (6, 6) covariance of it, as `relative_covariance`; None where the poses' own errors are not known.
     """
 
     first: str

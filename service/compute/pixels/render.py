@@ -27,7 +27,7 @@ class PixelRays:
     """Normalised coordinates x/z, y/z of every pixel centre: rows[v] @ columns, both as polynomials.
 
     Attributes:
-        width, height: of the image in pixels.
+        width, height: size of the image in pixels.
         rows: (height, K) basis of the row.
         columns: (K, width, 2) basis of the column, for x and y.
     """
@@ -307,7 +307,7 @@ def seen_points(
     Args:
         points_m: (N, 3) points on the surface whose depth `depth_m` is.
         camera: the camera of the depth.
-        T_world_camera: (4, 4) of the view.
+        T_world_camera: (4, 4) pose of the view.
         depth_m: (H, W) z of the surface; 0 where none is seen.
     """
     before = apply(inverse(T_world_camera), points_m)

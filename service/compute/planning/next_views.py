@@ -129,7 +129,7 @@ def mounting_covariance(
 
     Args:
         views: information (6, 6) and T_base_camera of each; together they must determine the pose.
-        covariance: (6, 6) of T_flange_camera, as (d, w) in flange axes with R → exp(w) R, t → t + d.
+        covariance: (6, 6) covariance of T_flange_camera, as (d, w) in flange axes with R → exp(w) R, t → t + d.
         centre_m: (3,) base frame.
     """
     normal, moved = np.zeros((6, 6)), np.zeros((6, 6))
@@ -154,7 +154,8 @@ def lens_covariance_of_pose(
     Args:
         views: information (6, 6) and T_base_camera of each; together they must determine the pose.
         camera: intrinsics.
-        covariance: (4, 4) of fx, fy, cx, cy or (8, 8) with the distortion, which counts for nothing at the centre.
+        covariance: (4, 4) covariance of fx, fy, cx, cy or (8, 8) with the distortion, which counts for nothing at the
+            centre.
         centre_m: (3,) base frame.
     """
     normal, moved = np.zeros((6, 6)), np.zeros((6, 4))

@@ -68,8 +68,8 @@ class RobotPoseTable:
 
     Attributes:
         names: names of the images; None if the file has none.
-        position: (M, 3) as written.
-        rotation: (M, 3 or 4) as written.
+        position: (M, 3) positions as written.
+        rotation: (M, 3 or 4) rotations as written.
         form: format of `rotation`.
         unit: unit of `position`.
         plain: the file says itself what it holds: names, and quaternions in metres.

@@ -40,7 +40,7 @@ class Timing:
         within_ns: largest time to the nearest message.
         interpolate: true to interpolate between the messages before and after, if these are not farther apart than
             `most_ns`.
-        most_ns: see `interpolate`.
+        most_ns: largest time between these two messages.
     """
 
     within_ns: int = 0

@@ -59,7 +59,7 @@ def odd_images(
     """Find the images that contradict a registration of all of them.
 
     Args:
-        outlines: per image, all that were found in it.
+        outlines: all outlines that were found in each image.
         images: the images with the poses as given.
         spheres: the registration spheres.
         registration: the registration of all images.

@@ -100,11 +100,11 @@ class RegistrationSettings:
         cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
             `algebraic` is the paper's plain x^T E x.
         robust: true to weight outlines robustly and exclude outliers.
-        pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
-            the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
-            "exact": no pose errors; "free": the outlines alone determine where each camera was.
-        intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
-            errors do not depend on the intrinsics'. None leaves them to the error budget.
+        pose_covariance: (N, 6, 6) covariance of each pose's (position in the unit of the poses, rotation vector in
+            radians) in the axes of its base, independent between images; "estimate": isotropic, estimated from the
+            residuals; "exact": no pose errors; "free": the outlines alone determine where each camera was.
+        intrinsics_covariance: (4, 4) covariance of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for
+            poses whose errors do not depend on the intrinsics'. None leaves them to the error budget.
         common_errors: prior sizes of errors shared by all outlines of a capture.
     """
 

@@ -32,12 +32,12 @@ class RigidMean:
 
     Attributes:
         T: (4, 4) T_a_b.
-        covariance: (6, 6) of (d, w) of `T`: exp([w]x) R, t + d, m and rad. It follows the scatter of the poses where
-            that is larger than their stated covariances.
+        covariance: (6, 6) covariance of (d, w) of `T`: exp([w]x) R, t + d, m and rad. It follows the scatter of the
+            poses where that is larger than their given covariances.
         chi2_reduced: reduced chi square of the poses in the mean against their given covariances; 1 for a single
             pose.
-        kept: (N,) poses that agree with the mean.
-        deviations: (N, 6) of (d, w) of every pose from the mean, m and rad.
+        kept: (N,) true for poses that agree with the mean.
+        deviations: (N, 6) deviation (d, w) of every pose from the mean, m and rad.
     """
 
     T: Transform
@@ -67,7 +67,7 @@ def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
 
     Args:
         poses: (N, 4, 4) measurements of T.
-        covariances: (N, 6, 6) of (d, w) of each, positive definite.
+        covariances: (N, 6, 6) covariance of (d, w) of each, positive definite.
 
     Raises:
         DataError: the shapes do not agree, or there is no pose.
@@ -137,7 +137,7 @@ class SightedPose:
     """The pose of a camera from the spheres in one of its images.
 
     Attributes:
-        T_scan_camera: (4, 4).
+        T_scan_camera: (4, 4) the camera's pose in the scan frame.
         noise: (6, 6) covariance due to the noise of the outlines, which differs between images.
         common: (6, 6) covariance due to errors of spheres, lens and edges, which many images share.
         spheres: number of spheres.
@@ -157,7 +157,7 @@ class FurtherPose:
 
     Attributes:
         mean: mean of the views' poses; its covariance is that of their noise alone.
-        covariance: (6, 6) of the mean, with what is common to the views.
+        covariance: (6, 6) covariance of the mean, with what is common to the views.
         names: names of the views, in the order of the mean's.
     """
 
@@ -171,8 +171,8 @@ class OuterFrame:
     """The first camera while a further one exposed.
 
     Attributes:
-        T_scan_first: (4, 4) its pose.
-        covariance: (6, 6) of that, the part that is common to all views.
+        T_scan_first: (4, 4) its pose in the scan frame.
+        covariance: (6, 6) the part of its pose's covariance that is common to all views.
     """
 
     T_scan_first: Transform = field(repr=False)

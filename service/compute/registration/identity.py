@@ -73,7 +73,7 @@ def identify(
     """Assign the registration spheres to outlines, station by station, so that all poses of a station agree.
 
     Args:
-        outlines: per image; those of other spheres stay unassigned.
+        outlines: the outlines of each image; those of other spheres stay unassigned.
         images: the images with their poses. If these are not metric, their scale is estimated too.
         spheres: the registration spheres.
 

@@ -85,8 +85,8 @@ def with_joint_pose_covariance(registration: RegistrationResult, covariance: Arr
 
     Args:
         registration: the registration of all images in `covariance`, in the same order.
-        covariance: (6 N, 6 N) of the poses given to `register` (positions in their unit, rotation vectors), from
-            `similarity_covariance`.
+        covariance: (6 N, 6 N) covariance of the poses given to `register` (positions in their unit, rotation
+            vectors), from `similarity_covariance`.
 
     Raises:
         DataError: the covariance is for another number of images.

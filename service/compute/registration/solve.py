@@ -56,8 +56,8 @@ def register(
     as priors.
 
     Args:
-        outlines: per image, from the detector.
-        assignments: per image, outline index → marker index, and an initial pose (from `identify`).
+        outlines: the detector's outlines of each image.
+        assignments: outline index → marker index of each image, and an initial pose (from `identify`).
         images: the images with their poses; images of one station share a base frame.
         spheres: the registration spheres.
         settings: the unknowns, the residual, and how well the inputs are known.

@@ -94,9 +94,9 @@ class SiftFeatures:
     """SIFT features of one image.
 
     Attributes:
-        points: (n, 2) in COLMAP's image coordinates, first pixel's centre at 0.5.
-        scales_px: (n,).
-        orientations_rad: (n,).
+        points: (n, 2) places in COLMAP's image coordinates, first pixel's centre at 0.5.
+        scales_px: (n,) scales.
+        orientations_rad: (n,) orientations.
         descriptors: (n, 128) uint8, with L1-root normalisation.
     """
 

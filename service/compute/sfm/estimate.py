@@ -84,7 +84,7 @@ class SfmWorkspace:
 
     Attributes:
         folder: the folder for features, matches, models and COLMAP's logs; created if missing.
-        camera: calibrated at the images' size; fixed unless the options refine it.
+        camera: the camera, calibrated at the images' size; fixed unless the options refine it.
         options: settings.
         progress: called now and then with (stage, done, total); stage is extract, match, map or adjust, and total is
             0 if COLMAP does not report it.

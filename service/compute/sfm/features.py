@@ -31,7 +31,7 @@ class ImageFeatures:
     """SIFT features of one image (colmap.py says which, if there are too many).
 
     Attributes:
-        width, height: of the image as captured, px.
+        width, height: size of the image as captured, px.
         pixels: (n, 2) float32 in the image as captured, first pixel's centre at 0.
         scales_px: (n,) float32 in the image as captured.
         descriptors: (n, 128) uint8.
@@ -177,7 +177,7 @@ class Tracks:
     Attributes:
         image: (O,) index of the image, in the order of the model's poses.
         point: (O,) index of the point.
-        pixels: (O, 2) in the image as captured.
+        pixels: (O, 2) places in the image as captured.
         points: (P, 3) positions in the model's frame and unit; every point has at least two observations.
     """
 

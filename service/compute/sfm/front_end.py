@@ -51,11 +51,11 @@ class FrontEnd:
         """Prepare the front end; processes are started with the first work.
 
         Args:
-            camera: calibrated at the images' size.
+            camera: the camera, calibrated at the images' size.
             options: settings.
             processes: number of children working in parallel, each on one core.
             log: file for COLMAP's output; None: a temporary one. Further processes write beside it.
-            child: used instead of own children, and left running.
+            child: a process to use instead of own children, and leave running.
         """
         self._camera = camera
         self._options = options or SfmOptions()
@@ -189,7 +189,7 @@ class CachedFrontEnd:
 
     Attributes:
         workspace: existing folder in which they are stored.
-        camera: calibrated at the images' size.
+        camera: the camera, calibrated at the images' size.
         settings: settings with which they are computed.
         seconds: wall time of each stage that is run is written here.
     """

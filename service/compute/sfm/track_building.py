@@ -77,7 +77,7 @@ def thinned(sightings: TrackedFeatures, pixels: Array, share: int, pair_share: i
 
     Args:
         sightings: all tracks.
-        pixels: (O, 2) of the observations.
+        pixels: (O, 2) places of the observations.
         share: number of tracks per image, spread over a grid of cells.
         pair_share: number of tracks per pair of images, if it has as many.
         size: width and height of the images, px.

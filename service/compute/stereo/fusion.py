@@ -34,8 +34,8 @@ class Field:
 
     Attributes:
         blocks: (B, 3) integer place of each block; voxel (i, j, k) of it is at (SIDE block + (i, j, k)) voxel_m.
-        distance: (B, SIDE³) in voxels, within ±TRUNCATION.
-        weight: (B, SIDE³).
+        distance: (B, SIDE³) distances in voxels, within ±TRUNCATION.
+        weight: (B, SIDE³) weights.
         maps: (B, SIDE³) number of depth maps that contributed.
         voxel_m: edge of a voxel.
     """

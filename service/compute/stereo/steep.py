@@ -218,8 +218,8 @@ def beliefs(costs: Floats, edges: Ints, per_step: float, most: float) -> Floats:
     """Return (V, L) the cost of each label at each vertex, when all others choose as suits them.
 
     Args:
-        costs: (V, L) of a label at a vertex alone.
-        edges: (E, 2) of neighbours.
+        costs: (V, L) cost of a label at a vertex alone.
+        edges: (E, 2) pairs of neighbours.
         per_step: cost of neighbours whose labels differ by one.
         most: cost of neighbours whose labels differ by much.
     """
@@ -276,8 +276,8 @@ class Photograph:
 
     Attributes:
         detail: (H, W) grey values without shading.
-        farthest: depth of what is known around a pixel; infinite where nothing is.
-        nearest: the same; 0 where nothing is.
+        farthest: greatest depth of what is known around a pixel; infinite where nothing is.
+        nearest: least depth of what is known around a pixel; 0 where nothing is.
     """
 
     view: StereoView
@@ -468,7 +468,7 @@ def relaxed(
         points_m: (V, 3) vertices, at which the springs have no force.
         held: (V,) stiffness of the springs, 0 to 1.
         fixed: (V,) vertices that do not move.
-        edges: (E, 2) of neighbours.
+        edges: (E, 2) pairs of neighbours.
         even_m: length over which the plate evens out what springs of stiffness 1 hold.
         slip_m: extension that halves the stiffness of a spring, so that single errors do not hold the plate.
     """

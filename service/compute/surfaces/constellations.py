@@ -181,7 +181,7 @@ class MergedParts:
     """The poses of parts in the frame of the first one.
 
     Attributes:
-        T_first_part: (4, 4) of each part, metres; the identity for the first.
+        T_first_part: (4, 4) pose of each part, metres; the identity for the first.
         spheres: number of different spheres.
         shared: number of spheres that two parts or more show.
         residuals_m: distance of every sphere that is shared, in every part, from its mean over the parts.

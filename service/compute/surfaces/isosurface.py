@@ -176,7 +176,7 @@ def sphere_contrasts(
     Spheres of a segmentation that is mirrored, or of another series, are found where there is none in the volume.
 
     Args:
-        hounsfield: (K, J, I).
+        hounsfield: (K, J, I) the volume in HU.
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
         centres_m: (N, 3) centres of the spheres in the CT frame.
         radius_m: radius of the spheres.

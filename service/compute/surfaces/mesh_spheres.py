@@ -42,8 +42,8 @@ class MeshSphere:
     """A sphere of known radius, located in a mesh.
 
     Attributes:
-        centre_m: (3,) in the mesh's frame.
-        covariance: (3, 3) of the centre, m²; allows for errors that neighbouring vertices share.
+        centre_m: (3,) centre in the mesh's frame.
+        covariance: (3, 3) covariance of the centre, m²; allows for errors that neighbouring vertices share.
         rms_m: weighted root mean square distance of the inliers from the surface.
         radius_residual_m: radius of a free sphere fit to the same vertices, minus the known radius.
         radius_sigma_m: standard deviation of `radius_residual_m`.
@@ -477,7 +477,7 @@ def wrong_unit(vertices_m: Array, faces: NDArray[np.integer], radius_m: float) -
 
     Args:
         vertices_m: (V, 3) vertices as they were read.
-        faces: (F, 3).
+        faces: (F, 3) indices of vertices.
         radius_m: radius of the spheres.
 
     Returns:

@@ -26,7 +26,7 @@ class Surfels:
         position: (N, 3) centroids.
         normal: (N, 3) unit normals of either sign.
         area: (N,) m².
-        outward: (N, 3) area-weighted mean of the unit normals stated by the data; 0 if there are none.
+        outward: (N, 3) area-weighted mean of the unit normals in the data; 0 if there are none.
     """
 
     position: Array
@@ -130,10 +130,10 @@ class TukeyStep:
     Attributes:
         unit: (N, 3) directions from the centre to the samples.
         residual: (N,) distances from the sphere, m, outward positive.
-        cosine: (N,) between normal and radius, without sign.
-        eligible: (N,) whether a sample lies in the band.
+        cosine: (N,) cosine between normal and radius, without sign.
+        eligible: (N,) true if a sample lies in the band.
         weights: (N,) Tukey's weights times the samples' areas.
-        step: (3,) of the centre, m.
+        step: (3,) step of the centre, m.
     """
 
     unit: Array
@@ -151,7 +151,7 @@ class OrientedPoints:
     Attributes:
         points: (N, 3), m.
         normals: (N, 3) unit, of either sign.
-        area: (N,) that each sample represents.
+        area: (N,) area that each sample represents.
     """
 
     points: Array
@@ -246,9 +246,9 @@ class SphereSamples:
     a cap's centre by as much, while its vertices lie on the sphere.
 
     Attributes:
-        points: (N, 3).
+        points: (N, 3) the places, m.
         normals: (N, 3) unit, of either sign, averaged over the neighbourhood.
-        outward: (N, 3) normals stated by the data (0 if none), averaged over the neighbourhood.
+        outward: (N, 3) normals in the data (0 if none), averaged over the neighbourhood.
         weight: (N,) area that each point represents; relative for points without faces.
     """
 
@@ -285,8 +285,8 @@ class SphereFit:
         rms: weighted root mean square distance of the inliers, m.
         radius_residual: radius of a free fit minus the known one, m; NaN if the inliers do not determine it.
         coverage: solid angle of the inliers, as a fraction of the whole sphere.
-        orientation: 1 if the stated normals point away from the centre, -1 if towards it, 0 if they disagree or there
-            are none.
+        orientation: 1 if the normals in the data point away from the centre, -1 if towards it, 0 if they disagree or
+            there are none.
         flank: area of the surface that continues smoothly beyond the inliers, over their area: a sphere's surface
             ends or meets something at an angle.
         form: rms of the averaged residuals from a free sphere, m: deviation from a sphere's shape.
