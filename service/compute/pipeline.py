@@ -188,7 +188,7 @@ def register_images(
         images: camera, poses and names of the images. If the poses are not metric, their scale is estimated.
         spheres: registration spheres, and control spheres if there are any.
         settings: the settings of `register`.
-        assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
+        assignments: registration sphere of outlines in each image, if `locate_outlines` knows it; None:
             identified here.
         search: searches images for control spheres that are missing among the outlines; None: they count as not
             measured.

@@ -24,9 +24,9 @@ _MAX_HALF = 30  # px; a larger window gains nothing, and lens distortion bends t
 _SMOOTHING = 0.15  # sigma of the smoothing, in half windows
 _MAX_SMOOTHING_PX = 1.5
 _MIN_CHARUCO_CORNERS = 8
-#: Largest relative error of a board's size if nothing is stated: 0.1 mm in 200 mm, as of boards made for measuring.
+#: Largest relative error of a board's size if none is given: 0.1 mm in 200 mm, as of boards made for measuring.
 SIZE_TOLERANCE = 5e-4
-#: Largest bow of a board if nothing is stated: composite plates and glued prints have 0.05 to 0.2 mm.
+#: Largest bow of a board if none is given: composite plates and glued prints have 0.05 to 0.2 mm.
 FLATNESS_M = 2e-4
 
 

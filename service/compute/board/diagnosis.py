@@ -22,7 +22,7 @@ _BORDER = 1.6  # corner spacings between the last visible corner and the frame: 
 _FEWEST_CORNERS = 8
 _FEWEST_CIRCLES = 12
 _ROUND = 0.85  # circularity of a dark spot that is no square: a square has 0.79, a circle at 45° 0.9
-_MARKER_OFF = 0.05  # relative error of a marker's side that is told
+_MARKER_OFF = 0.05  # relative error of a marker's side that is reported
 _DICTIONARIES = tuple(
     sorted(
         (name for name in dir(cv2.aruco) if name.startswith("DICT_") and "APRILTAG" not in name),
@@ -177,7 +177,7 @@ def _charuco(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def _variants(board: Board) -> list[tuple[Board, str, str]]:
-    """Return boards that are often confused, each with the mistake in words and the option that corrects it."""
+    """Return boards that are often confused, each with the text of the mistake and the option that corrects it."""
     c, r = board.columns, board.rows
     counts = (
         ((c, r), ""),

@@ -41,7 +41,7 @@ class ControlSphereError:
     sphere: int
     radial_error_mm: float
     reprojection_error_px: float
-    sigma_mm: float | None = None  # predicted rms of the radial error; None without stated covariances
+    sigma_mm: float | None = None  # predicted rms of the radial error; None without given covariances
     normalised: float | None = None  # rms of its three residuals over their predicted sigmas
 
 

@@ -24,7 +24,7 @@ MOST_WORST_MM = 0.5  # radial error of one control sphere, where the paper's mea
 LEAST_SHARE = 0.5  # of the outlines of one control sphere that should be seen
 _NEAR_RADII = 1.0  # around a place that the images agree on, where the outlines that lack are searched
 _FOUND_SHARE = 0.3  # of a capture's images: in a capture that shows no control sphere in so many, none was placed
-_SIGMAS, _LEAST_DISPLACEMENT_M = 5.0, 0.3e-3  # from which a displacement is told
+_SIGMAS, _LEAST_DISPLACEMENT_M = 5.0, 0.3e-3  # from which a displacement is reported
 
 #: Images, by index, and the cones that are expected in each, with the angle (rad) that each may be off.
 ExpectedNearby = Sequence[tuple[int, Sequence[tuple[Cone, float]]]]

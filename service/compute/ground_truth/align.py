@@ -132,7 +132,7 @@ def align(ct: Surface, scan: Surface, radius_m: float) -> Aligned:
     """Find the spheres of a radius in both meshes and register them.
 
     Raises:
-        ComputeError: spheres are lacking, or the two constellations do not agree.
+        ComputeError: spheres are missing, or the two constellations do not agree.
     """
     return align_spheres(_located(ct, radius_m), _located(scan, radius_m))
 

@@ -14,7 +14,7 @@ from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.geometry import Array
 
 _CHUNK = 1_000_000  # queries at a time, which limits the memory
-_PROBE = 4096  # consecutive points that are looked at to tell whether their order is spatial
+_PROBE = 4096  # consecutive points by which to decide whether their order is spatial
 _NEAR = 0.02  # of the extent: a usual step between consecutive points in spatial order is shorter
 _CELLS = 128  # along the longest side of a block of points, in the grid that says how far it is
 _GROUP = 4096  # queries that lie together

@@ -214,7 +214,7 @@ def calibrate_hand_eye(
         DataError: array shapes do not match, values are not finite, or the joints are another arm's.
         ComputeError: too few views, too little rotation, rotation about one axis only, poses that do not fit the
             images (`check_setup` names the reading that does), more than a third of the images disagree with the
-            robot, or the board's size differs from the stated one by more than its tolerance and the uncertainty.
+            robot, or the board's size differs from the given one by more than its tolerance and the uncertainty.
     """
     data, poses = _measured(views), views.poses
     if setup == "eye-to-hand":
@@ -305,7 +305,7 @@ def _agreed(
         keep = ~np.isin(np.arange(len(turned)), list(excluded))
         good = straight.take(keep)
         free = without_size(good)
-        sized(free, free.scale)  # before a fit that believes the stated size hides the difference in its noise
+        sized(free, free.scale)  # before a fit that believes the given size hides the difference in its noise
         weighted = fit_method(good, "weighted")
         answer = weighted if method == "weighted" else fit_resized(good, method, weighted, weighted.scale)
         return _Agreed(straight, turned, sigma_px, excluded, answer, weighted, free)

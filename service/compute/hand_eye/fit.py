@@ -60,7 +60,7 @@ _MAX_EXCLUDED = 1 / 3
 _ARM_FLOOR_M = 3e-6  # no arm is more repeatable
 _MIN_ARM_VIEWS = 9
 _ROUNDS = 6
-_DERIVATIVES = 2  # how often the arm's derivative is taken anew; after two, a micrometre is left
+_DERIVATIVES = 2  # how often the arm's derivative is taken again; after two, a micrometre is left
 ANY_SIZE = 1.0  # relative standard deviation of a board's size of which nothing is known
 
 
@@ -93,7 +93,7 @@ class HandEyeSolution:
 class HandEyeMeasurements:
     """All measurements of N views; `corners` and `joints_rad` (N, J) if known.
 
-    `size_sigma` is the relative standard deviation of the board's stated size.
+    `size_sigma` is the relative standard deviation of the board's given size.
     """
 
     hands: Array

@@ -30,8 +30,8 @@ _MIN_ROTATION_DEG = 15.0  # largest rotation between two views
 _MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
 _SUBSETS, _SUBSET_SIZE = 24, 8
 _SPOILT = 2.0  # times larger median deviation: leaving the worst quarter out has not helped
-_FAR_BETTER = 3.0  # times smaller misfit without the stated size
-_USUAL_NOISE_M = 1e-3  # of an arm, to weigh the stated size of the board against the views
+_FAR_BETTER = 3.0  # times smaller misfit without the given size
+_USUAL_NOISE_M = 1e-3  # of an arm, to weigh the given size of the board against the views
 
 
 def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transform:
@@ -125,7 +125,7 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
 
 @dataclass(frozen=True, slots=True)
 class RobustStart:
-    """T_flange_camera, T_base_board and the board's scale (true size over the stated one)."""
+    """T_flange_camera, T_base_board and the board's scale (true size over the given one)."""
 
     T_flange_camera: Transform
     T_base_board: Transform
@@ -146,7 +146,7 @@ def scaled(boards: Array, scale: float) -> Array:
 def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
     """Return Park's rotation, which no scale changes, and positions with the board's scale by linear least squares.
 
-    The stated size counts as one measurement with an error of 100 %, so that views that do not determine the scale
+    The given size counts as one measurement with an error of 100 %, so that views that do not determine the scale
     leave it where it is; if the views fit far better without it, as with lengths in another unit, it does not count.
     """
     R = solve_closed_form(hands, boards, "park")[:3, :3]
@@ -285,7 +285,7 @@ class PosesAsRead:
 class SetupFit:
     """Agreement of the views under one reading of the poses: medians over the views, and the board's relative size.
 
-    `mm` is a length on the board as it was stated, so that it does not depend on the unit of the robot's positions.
+    `mm` is a length on the board as it is described, so that it does not depend on the unit of the robot's positions.
     """
 
     mm: float

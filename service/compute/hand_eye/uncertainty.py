@@ -118,10 +118,10 @@ def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Arra
     return covariance * np.outer(factor, factor)
 
 
-# The board's size by the robot's lengths: its ratio to the stated size, whether that is credible, and what it
+# The board's size by the robot's lengths: its ratio to the given size, whether that is credible, and what it
 # means.
 #
-# The stated size of a board scales the camera's distance from it. The robot is the second ruler: it moves by known
+# The given size of a board scales the camera's distance from it. The robot is the second ruler: it moves by known
 # lengths between the images. Where the two differ by more than the board's tolerance and the uncertainty of the
 # comparison, one of them is wrong, and a fit would hide the difference in the camera's position.
 
@@ -131,7 +131,7 @@ _SURE = 3.0  # standard deviations
 _UNEXPLAINED = 4.0  # times as much scatter in position as the rotations explain
 _USUAL_M = 1.5e-3  # along each axis; joints of which one errs more than the others reach this in position alone
 _LIKE = 0.05  # relative difference up to which a ratio counts as a known one
-#: Ratios of true to stated size that mistakes other than of the unit lead to.
+#: Ratios of true to given size that mistakes other than of the unit lead to.
 _KNOWN: tuple[tuple[float, str], ...] = (
     (2.0, "the distance of two rows of circles, or half a square, given for the whole has this ratio"),
     (0.5, "the distance of two circles in a row, or two squares, given for one has this ratio"),
@@ -143,7 +143,7 @@ _PRINTED = (0.85, 1.18)  # A4 on Letter and back, and the printers' "fit to page
 
 @dataclass(frozen=True, slots=True)
 class BoardSizeFound:
-    """The board's true size over the stated one, as the robot's lengths show it.
+    """The board's true size over the given one, as the robot's lengths show it.
 
     Attributes:
         ratio: the ratio by robot and images alone.

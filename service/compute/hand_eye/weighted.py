@@ -12,7 +12,7 @@ prior φ ~ N(0, s²) in units of usual tolerances. Where φ is large, the report
 φ0, and e is the increment from there plus G_i φ0. The variances σ_t², σ_r² and s² maximise the restricted likelihood
 (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
 
-κ is the board's true size over the stated one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
+κ is the board's true size over the given one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
 board's tolerance. It scales the translation of T_camera_board. Without it, a board printed at 97 % moves the camera
 along its axis by 3 % of the distance, and where the distance hardly varies, no residual shows it.
 """
@@ -72,7 +72,7 @@ class BoardViews:
 
     @property
     def size_precision(self) -> float:
-        """Inverse variance of the board's stated size."""
+        """Inverse variance of the board's given size."""
         return 1 / max(self.size_sigma, _LEAST_SIGMA) ** 2
 
     def take(self, which: NDArray[np.bool_]) -> BoardViews:
@@ -104,7 +104,7 @@ class Fit:
 
     T_flange_camera: Transform
     T_base_board: Transform
-    scale: float  # of the board: true size over the stated one
+    scale: float  # of the board: true size over the given one
     arm: Array
     covariance: Array  # (13 + K, 13 + K): T_flange_camera, T_base_board, each (d, w) in its outer axes; scale; arm
 
@@ -164,7 +164,7 @@ def _grams(views: BoardViews, noise: Noise, fit: Fit) -> Array:
 
 
 def _with_prior(gram: Array, views: BoardViews, scale: float) -> Array:
-    """Return a summed Gram matrix with the board's stated size as one more row."""
+    """Return a summed Gram matrix with the board's given size as one more row."""
     row = np.zeros(len(gram))
     row[_SCALE], row[-1] = 1.0, scale - 1
     return gram + views.size_precision * np.outer(row, row)
@@ -350,7 +350,7 @@ def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
 def prior_share(views: BoardViews, noise: Noise, fit: Fit) -> Array:
     """Return (13 + K, 13 + K) part of the answer's covariance that is due to what was known before the images.
 
-    The images pull the board's size and the arm's parameters away from their stated values only as far as they
+    The images pull the board's size and the arm's parameters away from their given values only as far as they
     determine them. The rest of their errors stays, however often the images are resampled.
     """
     pull = fit.covariance[:, _SCALE:]

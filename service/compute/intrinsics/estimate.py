@@ -106,10 +106,10 @@ class IntrinsicsResult:
 def calibrate_intrinsics(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], *, model: LensModel = "opencv4"
 ) -> IntrinsicsResult:
-    """Calibrate a camera from views of a board that is flat, or bent within its stated flatness.
+    """Calibrate a camera from views of a board that is flat, or bent within its given flatness.
 
     The bow of a board acts on the views like another lens: a tenth of a millimetre changes the focal length by ten of
-    the standard deviations that a fit without it would state. So its two terms are estimated with the camera.
+    the standard deviations that a fit without it would report. So its two terms are estimated with the camera.
 
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, with OpenCV's distortion.
     k3 … k6 have a weak prior (`prior_precision`), which takes effect only if the images do not determine them.
@@ -182,7 +182,7 @@ def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Tra
 
 
 def surface_of(board: Board) -> BoardSurface:
-    """Return the board's surface as the stated flatness allows it to be bent."""
+    """Return the board's surface as the given flatness allows it to be bent."""
     flat = replace(board, bow_m=(0.0, 0.0))
     if board.flatness_m == 0:
         return flat_surface(board.points())

@@ -78,7 +78,7 @@ def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
 def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> OpticsComparison:
     """Compare images with those of the calibration, property by property.
 
-    The calibrated value is the one that most of the calibration's images state. Focus, aperture and zoom change the
+    The calibrated value is the one that most of the calibration's images report. Focus, aperture and zoom change the
     focal length and the distortion; another lens, body or image size is another camera. Exposure time and ISO do not
     matter. Pass the calibration's own images as `capture` to check it for changes within.
 

@@ -202,7 +202,7 @@ _TILT_DEG = 30.0
 _HELD_OUT_FACTOR = 1.3
 _INFLATION = 4.0
 _SIMPLE = ("pinhole", "radial2", "opencv4", "opencv5")  # models that a wide lens does not follow
-_WIDE = 0.5  # times as large residuals with the rational model tell a wide lens
+_WIDE = 0.5  # times as large residuals with the rational model indicate a wide lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +320,7 @@ def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) 
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
-    """Return reasons to trust this calibration less, in words; empty if there are none."""
+    """Return reasons to trust this calibration less; empty if there are none."""
     found: list[str] = []
     n = len(result.views)
     if n < _VIEWS:

@@ -23,7 +23,7 @@ _LENS = 8  # focal length, fy over fx, cx, cy, k1, k2, p1, p2
 _ITERATIONS = 12
 _DONE = 1e-6  # metres and radians
 _LONGEST_STEP = 0.1
-# Outlines err by more than their stated covariance: chi² per coordinate in bench/results/outlines*.md.
+# Outlines err by more than their given covariance: chi² per coordinate in bench/results/outlines*.md.
 _OUTLINE_CHI2 = 1.5
 _DOUBTFUL = 3.5  # standard deviations beyond which an outline is downweighted
 

@@ -296,7 +296,7 @@ def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
     """Return the boxes by image name from a JSON file, such as Grounding DINO's.
 
     Raises:
-        DataError: the file is not JSON of this form, a box has no area, or an image is not among `names`.
+        DataError: the file is not JSON of this format, a box has no area, or an image is not among `names`.
     """
     data = parse_json(file_text(path), name=str(path), remedy=_FORM)
     if not isinstance(data, dict):

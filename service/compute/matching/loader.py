@@ -46,7 +46,7 @@ class View:
 class Correspondences:
     """Points of the surface in two images: pixels (N, 2) of each, and VISIBLE, OCCLUDED, OUTSIDE or UNKNOWN (N,).
 
-    Pixels of the second image are stated wherever the point is in front of its camera, else they are NaN.
+    Pixels of the second image are given wherever the point is in front of its camera, else they are NaN.
     """
 
     first_px: Array = field(repr=False)

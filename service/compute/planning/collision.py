@@ -56,7 +56,7 @@ class Contact:
     clearance_m: float  # negative: depth of the overlap
 
     def __str__(self) -> str:
-        """Return the contact in words, for a technician."""
+        """Describe the contact for a technician."""
         if self.clearance_m < 0:
             return f"the {self.first} would touch the {self.second}"
         return f"the {self.first} would come within {mm(self.clearance_m):.0f} mm of the {self.second}"

@@ -28,7 +28,7 @@ _LIFT_M = 0.002  # of points above the simplified surface, so that it does not o
 _BOARD_M = 0.004  # thickness of the layer that counts as the board
 _CLEAR_OF_SPHERES = 1.4  # radii
 _DOME_TILTS_DEG = (0.0, 20.0, 40.0, 55.0)
-_MARGIN_M = 0.08  # margin of surface kept around the spheres
+_MARGIN_M = 0.08  # margin of surface left around the spheres
 
 
 @dataclass(frozen=True, slots=True)

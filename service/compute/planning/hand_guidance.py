@@ -1,4 +1,4 @@
-"""Guidance for a hand-held camera: the wanted places, and words that lead from the current one to them.
+"""Guides a hand-held camera: the wanted places, and the text that leads from the current one to them.
 
 The level frame is in the middle of the scene: z up, y in the direction in which the first image's top pointed, so
 that the person stood at −y. A camera's attitude is `turn` about z, `lean` of its right side down and `tilt` of its
@@ -95,7 +95,7 @@ def place_at(
 
 
 def words(T_level_here: Transform, T_level_there: Transform) -> str:
-    """Return words such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
+    """Return a text such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
 
     Both poses are in the level frame. Left, right, forward and back are those of a holder who looks in the direction
     of the image's top; the camera is first moved, then turned. Empty if there is nothing to change.

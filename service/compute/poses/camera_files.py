@@ -65,7 +65,7 @@ def read_camera_json(path: Path) -> CameraModel:
 
 
 def write_camera_json(path: Path, camera: CameraModel, *, simulated: bool = False) -> None:
-    """Write a camera in the form that `read_camera_json` reads."""
+    """Write a camera in the format that `read_camera_json` reads."""
     mark = {_SIMULATED: True} if simulated else {}
     path.write_text(json.dumps(mark | camera.record(), indent=2) + "\n", encoding="utf-8")
 

@@ -150,7 +150,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
     """Return T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
 
     Raises:
-        DataError: the file has another form; the message names file:line.
+        DataError: the file has another format; the message names file:line.
     """
     poses: dict[str, Transform] = {}
     rows = csv_rows(path)
@@ -186,7 +186,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
 
 
 def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None:
-    """Write poses in the form that `read_poses_csv` reads."""
+    """Write poses in the format that `read_poses_csv` reads."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(_HEADER)
@@ -201,7 +201,7 @@ def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None
 def read_transforms_json(path: Path) -> dict[str, Transform]:
     """Return T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
 
-    Cameras look along -z, but those of NeuS2's own form and of Mitsuba along +z. Names are the frames' file_path
+    Cameras look along -z, but those of NeuS2's own format and of Mitsuba along +z. Names are the frames' file_path
     without a leading "./". Where `unit_box.json` of our own export lies beside it, positions are taken back to the
     world.
 
@@ -343,7 +343,7 @@ def _trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
     """Return T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
 
     Raises:
-        DataError: a line has another form, or a timestamp occurs twice; the message names file:line.
+        DataError: a line has another format, or a timestamp occurs twice; the message names file:line.
     """
     poses: dict[str, Transform] = {}
     for row in table.rows:

@@ -83,14 +83,14 @@ class RobotPoseTable:
     plain: bool
 
     def poses(self, form: RotationForm | None = None) -> Array:
-        """Return (M, 4, 4) poses with positions in metres, with the rotations in this form or the file's."""
+        """Return (M, 4, 4) poses with positions in metres, with the rotations in this format or the file's."""
         out = np.tile(np.eye(4), (len(self.position), 1, 1))
         out[:, :3, :3] = _matrices(self.rotation, form or self.form)
         out[:, :3, 3] = METRES_PER[self.unit] * self.position
         return out
 
     def other_readings(self) -> Iterator[tuple[Array, str, str]]:
-        """Yield (M, 4, 4) poses by each other form of rotation, in words after "they fit", and what to do."""
+        """Yield (M, 4, 4) poses by each other format of rotation, a text after "they fit", and the advice."""
         for form in _forms(self.rotation.shape[1]):
             if form != self.form:
                 yield self.poses(form), f"with the rotations {_WORDS[form]}", f"Give --rotation {form}"
@@ -278,7 +278,7 @@ def _form(rotation: Array, wanted: RotationForm | None, stated: RotationForm | N
         )
     form: RotationForm = wanted or stated or possible[0]
     if wanted is None and form in ("rotvec", "rpy") and np.abs(rotation).max() > _TURN:
-        return "rpy-deg"  # of the forms in degrees the one that most programs write; the images tell
+        return "rpy-deg"  # of the formats in degrees the one that most programs write; the images decide
     return form
 
 

@@ -291,7 +291,7 @@ class CdrWriter:
         self._data += value
 
     def doubles(self, values: Sequence[float] | NDArray[np.float64], *, sequence: bool) -> None:
-        """Doubles: an array of fixed length, or a sequence, which states its length."""
+        """Write doubles: an array of fixed length, or a sequence, which gives its length."""
         if sequence:
             self.number("I", len(values))
         for value in values:

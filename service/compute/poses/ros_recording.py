@@ -362,6 +362,6 @@ class _Bounded:
 
 
 def _plain(error: BaseException) -> str:
-    """Return the words of an error in one printable line."""
+    """Return the text of an error in one printable line."""
     text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return "".join(c if c.isprintable() else "?" for c in text)[:300]

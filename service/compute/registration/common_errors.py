@@ -29,13 +29,13 @@ _SIGMAS = 5.0
 # 0.8e-4, by what single outlines share: a calibration is not expected to be better.
 _EXPECTED_FOCAL = 0.5e-4
 _SHARP_PX = 0.7  # blur up to which the sizes of the common errors were measured; they grow with it
-_NAMED_BLUR = 1.3  # times that, from which blur is told
+_NAMED_BLUR = 1.3  # times that, from which blur is reported
 _LIGHT_OF_GROWTH = 2 / 3  # as in EXPECTED_COMMON_ERRORS
 # Clean rendered scenes gave at most 1.1e-4 with focal length and scale free.
 _EXPECTED_SCALE = 1e-4
 _SIGN_OF_SCALE = 2e-4  # from which the positions that the outlines prefer are a sign of another scale
 _AGREES = 3.0  # standard deviations
-_LEAST_POSITIONS = 4  # that tell a scale
+_LEAST_POSITIONS = 4  # that determine a scale
 
 CommonErrorName = Literal["shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y", "scale"]
 
@@ -119,7 +119,7 @@ def beyond_model(
         scaled = _fitted(outlines, assignments, replace(images, metric=False), spheres, wide)
         told = () if scaled is None else _errors(scaled, images, common, lens_covariance)
         if any(e.significant for e in told if e.name == "scale") or _focal_length_is_off(told):
-            free, errors = scaled, told  # else the images cannot tell the two apart
+            free, errors = scaled, told  # else the images cannot separate the two
     significant: dict[CommonErrorName, CommonError] = {e.name: e for e in errors if e.significant}
     component = np.zeros((6, 6))
     if free is not None and significant:

@@ -43,7 +43,7 @@ class Contradiction:
     refuses: bool = False
 
 
-MOST_LEFT_OUT = 0.25  # share of the images: if more contradict one another, nothing tells which are wrong
+MOST_LEFT_OUT = 0.25  # share of the images: if more contradict one another, nothing shows which are wrong
 _TIMES_TYPICAL, _LEAST_PX = 5.0, 1.0  # of the other images' distance from the prediction
 _LEAST_SEEN, _SEEN_SHARE = 4, 0.3  # spheres that must be expected, and share of them that must be used
 _SAME_PLACE_M, _SAME_TURN_RAD = 5e-3, np.radians(1.0)  # of poses that are taken as one

@@ -72,7 +72,7 @@ class CommonErrors:
     and on the dark limb. No view separates it from a displacement of the scan, so this part of the predicted error
     remains however many images are taken. `own_light_px`: displacement, per coordinate, of each sphere by light that
     is its own, from the specimen and the table beside it, alike in all images: it counts as an error of the sphere's
-    centre in what is stated, but is not estimated, since it would take up other errors.
+    centre in what is given, but is not estimated, since it would take up other errors.
     """
 
     shift_px: float

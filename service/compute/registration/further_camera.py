@@ -61,8 +61,8 @@ def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
     """Return the pose T on which most of N independent measurements of it agree, weighted by their covariances.
 
     It minimises the sum of squared Mahalanobis distances of the poses that agree; the others are excluded. A distance
-    is judged against the stated covariances times a common factor, the median distance over its expectation, if that
-    is above 1: so the poses may scatter more than stated, as long as few stand out. If all contradict one another,
+    is judged against the given covariances times a common factor, the median distance over its expectation, if that
+    is above 1: so the poses may scatter more than given, as long as few stand out. If all contradict one another,
     none is excluded, and `covariance`, `chi2_reduced` and `rms_m` show it.
 
     Args:
@@ -224,7 +224,7 @@ def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
 def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]) -> FurtherPose:
     """Return T_first_camera of a camera beside the first one, from the views at which the first one's pose is known.
 
-    What both cameras' poses have in common by the spheres is counted twice, which states more than there is.
+    What both cameras' poses have in common by the spheres is counted twice, which overstates it.
 
     Raises ComputeError: there is no such view.
     """

@@ -97,7 +97,7 @@ _CHUNK = 4000  # triples refined at a time
 _TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
 _OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
 _EVIDENCE = 14.0  # log likelihood ratio of a marker to a false detection at an expected place; a low estimate
-_MOST_KEPT = 512  # images whose hypotheses are kept
+_MOST_KEPT = 512  # images whose hypotheses are cached
 _MARGIN = 9.0  # log odds at which an assignment counts as unique
 
 

@@ -163,7 +163,7 @@ def _require_any(
 
 
 def _named(markers: dict[int, int]) -> str:
-    """Return an assignment in words: outline = sphere, counted from 0."""
+    """Describe an assignment: outline = sphere, counted from 0."""
     return "{" + ", ".join(f"{d}={m}" for d, m in sorted(markers.items())) + "}"
 
 
@@ -429,7 +429,7 @@ def _words_of_other_scale(
 
 
 def words_of_unit(scale: float) -> str:
-    """Return the mistake by which lengths have to be multiplied by `scale`, in words within brackets, or nothing."""
+    """Return the mistake by which lengths have to be multiplied by `scale`, as text within brackets, or nothing."""
     others = (words for words, factor in _OTHER_MISTAKES.items() if abs(scale / factor - 1) < _NEAR)
     words = mistaken_length(scale, _NEAR) or next(others, "")
     return f" ({words})" if words else ""

@@ -1,4 +1,4 @@
-"""Propagates errors of camera poses: correlated ones into a registration, and those that a registration states."""
+"""Propagates errors of camera poses: correlated ones into a registration, and those that a registration reports."""
 
 from __future__ import annotations
 

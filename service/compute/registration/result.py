@@ -85,14 +85,14 @@ class RegistrationResult:
     residuals: tuple[OutlineResidual, ...]
     T_scan_camera: Array = field(repr=False)  # (N, 4, 4) metric, each image through its own group, poses as given
     chi2_reduced: (
-        float  # of the outlines with their stated covariances, per degree of freedom; near 1 if those are right
+        float  # of the outlines with their given covariances, per degree of freedom; near 1 if those are right
     )
     n_images: int
     cost: str
     components: dict[str, Array] = field(repr=False)
     T_scan_camera_refined: Array = field(repr=False)  # (N, 4, 4) corrected by the estimated pose errors
     pose_sigma: tuple[float, float]  # m and rad, rms per coordinate, of single poses' errors; 0 if taken as exact
-    outline_factor: float  # factor on the outlines' stated variances, estimated from the residuals
+    outline_factor: float  # factor on the outlines' given variances, estimated from the residuals
     solution: Solution = field(repr=False)
 
     @property

@@ -51,8 +51,8 @@ def register(
     """Estimate T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
 
     An outline contributes its three parameters, weighted by their covariance. Errors of the camera poses, which move
-    all spheres of an image together, are marginalised, with their size as stated or estimated from the residuals.
-    Errors of the spheres, of the intrinsics and those shared by all outlines are estimated, with their stated sizes
+    all spheres of an image together, are marginalised, with their size as given or estimated from the residuals.
+    Errors of the spheres, of the intrinsics and those shared by all outlines are estimated, with their given sizes
     as priors.
 
     Args:
@@ -211,7 +211,7 @@ def _begin(problem: Problem, start: State) -> _Iterate:
 
     def weighted(rows: Linearised) -> _Weighting:
         seen = np.linalg.norm(np.linalg.solve(problem.whiten, rows.r[:, :, None])[:, :2, 0], axis=1)
-        # From a tenth of a radius on, an outline is doubtful; stated covariances are not used here.
+        # From a tenth of a radius on, an outline is doubtful; given covariances are not used here.
         soft = 1 / (1 + (seen / problem.cones.half_angles / 0.1) ** 2)
         return _Weighting(soft / size * float(np.median(size)), none, 1.0)
 
@@ -419,7 +419,7 @@ def unknown_pose_noise(n_images: int) -> PoseNoise:
 
 
 def given_pose_noise(covariance: Array) -> PoseNoise:
-    """Return the stated covariances (N, 6, 6); the residuals can increase them, never decrease them."""
+    """Return the given covariances (N, 6, 6); the residuals can increase them, never decrease them."""
     values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return PoseNoise(root[None], 1.0, free=True)
@@ -432,7 +432,7 @@ def estimate(
 
     Args:
         blocks: linearised at the current solution.
-        noise: the form of the pose noise.
+        noise: the model of the pose noise.
         prior: (n, n) prior information on the common unknowns.
         prior_gradient: (n,) gradient of the prior at the current solution.
         start: current values.
@@ -441,7 +441,7 @@ def estimate(
     Biometrika 58(3), 1971. A wide prior on the logarithm of the outlines' factor limits the influence of few
     residuals.
 
-    The pose noise grows at most fivefold at a time. If residuals are far larger than stated, the minimiser's first
+    The pose noise grows at most fivefold at a time. If residuals are far larger than given, the minimiser's first
     step would otherwise make the poses carry no information, from which neither it nor the solution recovers.
     """
     n_free = len(start[1]) if noise.free else 0

@@ -86,7 +86,7 @@ def to_colmap_pixels(pixels: Array) -> Array:
     return pixels + HALF_PIXEL
 
 
-_LARGE_SHARE = 0.125  # of the features that are kept if there are too many
+_LARGE_SHARE = 0.125  # of the features that are selected if there are too many
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -143,7 +143,7 @@ def pairs_of(
 ) -> list[tuple[str, str]]:
     """Return pairs of names worth matching (see `choose_pairs`); they depend only on the set of images and poses.
 
-    Before the images are taken, the planned poses give the pairs with which matching can begin; at the end, the pairs
+    Before the images are taken, the planned poses give the pairs with which matching can start; at the end, the pairs
     of the images that were taken are the ones used.
     """
     order = sorted(names)

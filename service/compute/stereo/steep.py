@@ -31,9 +31,9 @@ _PER_STEP, _MOST = 0.06, 0.48  # cost of neighbours that move differently, by a 
 _THROUGH, _MOST_THROUGH = 0.15, 6  # cost of each view that sees through a place, up to so many
 _STAYS, _MOST_STAYS = 0.5, 3.0  # cost of a known vertex that moves, by a step and by many
 _NO_HOLD, _FULL_HOLD = 0.4, 0.8  # evidence up to which a vertex is not held in place then, and from which it is fully
-_LEAST_EVIDENCE = 0.2  # of a place that is kept
+_LEAST_EVIDENCE = 0.2  # of a place that is accepted
 _STEEP = 0.6  # cosine at the second view: what two views see less steeply, rectified matching would have found
-_FEW_THROUGH = 2  # views that see through a place that is not kept
+_FEW_THROUGH = 2  # views that see through a place that is not accepted
 _FIELD = 0.5  # of the views, that have a place in their image: the object, not the room
 
 Ints = NDArray[np.int64]

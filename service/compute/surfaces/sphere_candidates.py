@@ -78,7 +78,7 @@ _SETTLED = 1e-4  # length of the last step, in radii
 _FLANK = 0.12  # in radii beyond the band, where another shape would continue smoothly
 _FLANK_COSINE = 0.88
 _ROUGH_RMS = 0.013  # of the fit, in radii
-_WELL_COVERED = 0.3  # above it, accepted whatever its rms, so that the operator is told why it is refused
+_WELL_COVERED = 0.3  # above it, accepted whatever its rms, so that the operator learns why it is refused
 _MOST_FLANK = 0.6  # area of the flank over that of the inliers
 
 
