@@ -133,7 +133,7 @@ def require_same_pairs(results: Sequence[MethodResult], folder: Path) -> None:
 
 
 def _write_examples(wanted: MatchingTask, match: Match, data: MatchingData, pairs: Sequence[Pair]) -> None:
-    """The middle pair of each class, with its matches."""
+    """Draw the middle pair of each class, with its matches."""
     views = LoadedViews(data)
     for name in CLASSES:
         same = [pair for pair in pairs if pair["difficulty"] == name]

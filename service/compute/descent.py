@@ -32,7 +32,7 @@ def gauss_newton(
     settled: float,
     size: Callable[[StateT, Array], float] = lambda _state, step: largest(step),
 ) -> StateT:
-    """Gauss–Newton: stop after a step smaller than `settled`, or after `most` steps, and return the state.
+    """Take Gauss–Newton steps until one is smaller than `settled`, or `most` are done, and return the state.
 
     Args:
         start: initial state, near the minimum.

@@ -54,7 +54,7 @@ class Evaluation:
     errors: tuple[ControlSphereError, ...]
 
     def per_sphere(self) -> dict[int, tuple[float, float, int]]:
-        """Return map each sphere to its mean radial error (mm), mean reprojection error (px) and number of images."""
+        """Map each sphere to its mean radial error (mm), mean reprojection error (px) and number of images."""
         out: dict[int, tuple[float, float, int]] = {}
         for s in sorted({e.sphere for e in self.errors}):
             mine = [e for e in self.errors if e.sphere == s]

@@ -325,7 +325,7 @@ def fuse(
 
 
 def _smooth_step(x: Array) -> Array:
-    """0 up to 0, 1 from 1 on, with continuous curvature between."""
+    """Rise from 0 at 0 and below to 1 at 1 and beyond, with continuous curvature between."""
     t = np.clip(x, 0.0, 1.0)
     return t**3 * (10 + t * (6 * t - 15))
 

@@ -53,7 +53,7 @@ class BundleSolution:
 
 
 def solve(state: BundleState, data: AdjustmentData, sigmas: Sigmas, *, rounds: int = 3) -> BundleSolution:
-    """Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
+    """Adjust by Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
 
     The variances are Förstner's estimates: each component's weighted sum of squares over its redundancy (Koch,
     Parameter Estimation and Hypothesis Testing in Linear Models, 3.6).

@@ -225,7 +225,7 @@ class CrossValidation:
 
 
 def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidation:
-    """Return the validate a calibration over its views, five-fold and leave-one-out.
+    """Validate a calibration over its views, five-fold and leave-one-out.
 
     Raises:
         ComputeError: fewer than four views.

@@ -146,7 +146,7 @@ def ransac_cone(
     rng: np.random.Generator,
     trials: int = 400,
 ) -> tuple[Cone, NDArray[np.bool_]] | None:
-    """RANSAC: the cone on which most edge points agree, and which points (N,) do.
+    """Find the cone on which most edge points agree, by RANSAC, and which points (N,) do.
 
     Args:
         rays: (N, 3) unit rays of edge points.

@@ -45,7 +45,7 @@ def colour_gradient(image: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArra
 
 
 def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Thin edge pixels (H, W), with thresholds from the image's median gradient, not from its maximum."""
+    """Find thin edge pixels (H, W), with thresholds from the image's median gradient, not from its maximum."""
     size = np.abs(gx[::3, ::3].astype(np.int32)) + np.abs(gy[::3, ::3])
     low = float(np.clip(2.5 * np.median(size), 24, 80))
     return np.asarray(cv2.Canny(gx, gy, low, 2.2 * low) > 0)

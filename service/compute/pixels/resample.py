@@ -91,7 +91,7 @@ def camera_at(camera: CameraModel, width: int, height: int) -> CameraModel:
 
 
 def resample(image: NDArray[np.uint8], camera: CameraModel, width: int, height: int) -> NDArray[np.uint8]:
-    """Resize a photograph (H, W, 3) to (height, width, 3): reduced by area averaging, then cropped evenly.
+    """Resize a photograph (H, W, 3) to (height, width, 3): reduce by area averaging, then crop evenly.
 
     An aspect ratio other than the camera's (1920 × 1080 from a 3:2 sensor, as in the paper) crops two sides; pixels
     stay square.

@@ -287,7 +287,7 @@ class _Poses:
 
 
 def _damped_steps(J: Array, r: Array) -> Array:
-    """Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N), with limited rotations."""
+    """Return Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N), with limited rotations."""
     JJ = J.transpose(0, 2, 1) @ J
     H = JJ + 1e-9 * np.trace(JJ, axis1=1, axis2=2)[:, None, None] * np.eye(6)
     dx = -np.linalg.solve(H, np.einsum("kni,kn->ki", J, r)[:, :, None])[:, :, 0]

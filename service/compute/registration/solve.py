@@ -130,7 +130,7 @@ class _Iterate:
 
 
 def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) -> _Iterate:
-    """Gauss–Newton; a step that would increase the objective is halved.
+    """Descend by Gauss–Newton; a step that would increase the objective is halved.
 
     Halving, not damping: the poses' errors are eliminated with their own covariance, and a shorter step shortens them
     in proportion.

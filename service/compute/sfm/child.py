@@ -35,7 +35,7 @@ from service.core.geometry import Array, align_points
 
 
 def main(log: str, seed: int, pipe: Connection) -> None:
-    """Entry point: process (task, job) messages until the other end is closed.
+    """Process (task, job) messages until the other end is closed; this is the entry point.
 
     Sends ("progress", (stage, done, total)) in between, and ("result", value) or ("error", what) at the end of each.
     """

@@ -47,7 +47,7 @@ class CentreUncertainty:
 
 
 def estimate_noise(spheres: Sequence[Patches]) -> NoiseModel:
-    """Restricted maximum likelihood over a grid of lengths and ratios, from the residuals of all spheres together.
+    """Estimate noise by restricted maximum likelihood over a grid of lengths and ratios, from all spheres' residuals.
 
     Centre and radius of each sphere are projected out first, so that the part absorbed by the fit is accounted for.
 
