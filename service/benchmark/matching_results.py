@@ -156,7 +156,7 @@ def record(result: MethodResult) -> dict[str, Any]:
 
 
 def read_result(path: Path) -> MethodResult:
-    """Return a result as `record` wrote it.
+    """Read a result as `record` wrote it.
 
     Raises:
         DataError: the file is something else.

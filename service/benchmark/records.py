@@ -106,7 +106,7 @@ class BenchmarkResult(Record):
 
 
 def read_results(out: Path) -> tuple[BenchmarkResult, ...]:
-    """Return all results in a folder, by name of their folders.
+    """Read all results in a folder, by name of their folders.
 
     Raises:
         DataError: a file is not a result.

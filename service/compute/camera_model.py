@@ -131,7 +131,7 @@ class CameraCovariance:
 
 
 def read_camera_covariance(path: Path) -> CameraCovariance | None:
-    """Return the covariance that `calibrate intrinsics` wrote into camera.json; None if the file has none.
+    """Read the covariance that `calibrate intrinsics` wrote into camera.json; None if the file has none.
 
     Raises:
         DataError: the file is not JSON, or its `covariance` is malformed.

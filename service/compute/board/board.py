@@ -181,7 +181,7 @@ def find_board(image_grey: Grey, board: Board) -> BoardView:
 
 
 def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return all corners of a checkerboard, and which of them can be trusted.
+    """Find all corners of a checkerboard, and which of them can be trusted.
 
     A board with one even and one odd corner count is always numbered from the same physical corner, the one that
     makes the square between the first corners of the first two rows dark.

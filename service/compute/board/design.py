@@ -277,7 +277,7 @@ def choose_poses(
     enough: Callable[[PlanPrediction], bool] | None = None,
     seed: int = 0,
 ) -> Array:
-    """Return up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
+    """Choose up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
 
     Args:
         problem: the unknowns that the images must determine.

@@ -66,7 +66,7 @@ def locate_in_images(
     *,
     least_images: int = 3,
 ) -> dict[int, TriangulatedSphere]:
-    """Return the centres of spheres from their outlines and the registered cameras, each sphere on its own.
+    """Locate the centres of spheres from their outlines and the registered cameras, each sphere on its own.
 
     Weighted least squares of the cones' three parameters (`ObservedCones`); outlines more than 4 sigma from the
     others of their sphere are excluded. The covariance follows from the outlines', inflated if they scatter more.

@@ -183,7 +183,7 @@ def _ply_blocks(
 
 
 def read_ply(path: Path) -> tuple[dict[str, NDArray[np.generic]], IntArray]:
-    """Return the properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
+    """Read the properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
 
     Raises:
         DataError: another program wrote the file, or its end is missing.

@@ -155,7 +155,7 @@ class HandEyeMeasurements:
 
 
 def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[int, str]:
-    """Return the views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
+    """Find the views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
 
     Raises:
         ComputeError: more than a third of the views disagree.

@@ -61,7 +61,7 @@ def camera_share(solution: BundleSolution, data: AdjustmentData, known: CameraCo
 
 
 def _read_by(sightings: SphereSightings | None, held: CameraModel, other: CameraModel) -> SphereSightings | None:
-    """Return the outlines' cones recomputed from the same pixels with another camera model."""
+    """Compute the outlines' cones again from the same pixels with another camera model."""
     if sightings is None:
         return None
     azimuth = np.linspace(0.0, 2 * np.pi, _RIM, endpoint=False)

@@ -126,12 +126,12 @@ def develop(path: Path, jpeg_bgr: NDArray[np.uint8] | None, parameters: DevelopP
 
 
 def encode_tiff(image_bgr: Pixels16) -> bytes:
-    """Return a picture (H, W, 3) BGR as a TIFF with 16 bits a channel, compressed without loss."""
+    """Encode a picture (H, W, 3) BGR as a TIFF with 16 bits a channel, compressed without loss."""
     return cv2.imencode(".tif", image_bgr, _TIFF)[1].tobytes()
 
 
 def read_developed(path: Path) -> Pixels16:
-    """Return (H, W, 3) BGR of a TIFF that `encode_tiff` wrote. Raises DataError if it is not such a file."""
+    """Read (H, W, 3) BGR of a TIFF that `encode_tiff` wrote. Raises DataError if it is not such a file."""
     data = np.fromfile(path, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
@@ -285,7 +285,7 @@ class Shift:
 
 
 def find_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Shift:
-    """Return the shift between two grey pictures (H, W) of one size, in parts all over them.
+    """Find the shift between two grey pictures (H, W) of one size, in parts all over them.
 
     Phase correlation (Kuglin and Hines 1975) finds it to a pixel; least squares on the pixels to hundredths. Neither
     depends on the brightness or the contrast, which differ between a JPEG and a developed raw file.

@@ -71,7 +71,7 @@ def _unreadable(path: Path, error: OSError) -> DataError:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Return (H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
+    """Read (H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
 
     Raises:
         DataError: the file is missing, truncated or not a decodable image.

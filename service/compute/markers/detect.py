@@ -152,7 +152,7 @@ def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) 
 
 
 def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions) -> list[RoughSphere]:
-    """Return the discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
+    """Find the discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
     scale = min(1.0, options.coarse_width_px / camera.width)
     coarse_camera = camera
     coarse = image_bgr

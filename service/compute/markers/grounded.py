@@ -64,7 +64,7 @@ class GroundedDetector:
     def detect(
         self, image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = DEFAULTS
     ) -> tuple[SphereOutline, ...]:
-        """Return the outlines in an image (H, W, 3) of the camera's size, the most certain first."""
+        """Detect the outlines in an image (H, W, 3) of the camera's size, the most certain first."""
         boxes = [_widened(box) for box in find_boxes(image_bgr, self.networks, self.least, options)]
         roughs: list[RoughSphere] = []
         for box, mask in zip(boxes, _sphere_masks(image_bgr, boxes, self.networks), strict=True):

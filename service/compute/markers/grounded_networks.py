@@ -43,7 +43,7 @@ class Networks:
 
 
 def load_networks(weights: Weights) -> Networks:
-    """Return both networks with their weights, on the GPU if there is one; nothing is downloaded.
+    """Load both networks with their weights, on the GPU if there is one; nothing is downloaded.
 
     Raises:
         ConfigurationError: PyTorch or transformers are not installed.
@@ -82,7 +82,7 @@ def _network(folder: Path, kind: Any) -> Any:
 
 
 def _read(folder: Path, kind: Any, **options: bool) -> Any:
-    """Return a model or tokenizer of this class from its folder."""
+    """Read a model or tokenizer of this class from its folder."""
     try:
         return kind.from_pretrained(str(folder), local_files_only=True, **options)
     # Damaged weights and configurations raise whatever the parsers of these libraries do.

@@ -87,7 +87,7 @@ class _Task:
 
 
 def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """Return the outlines in one image file, searched whole.
+    """Detect the outlines in one image file, searched whole.
 
     Raises:
         DataError: the file is missing, truncated, no image or not of the camera's size; `where` names it.
@@ -215,7 +215,7 @@ def search_nearby(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
-    """Return the outlines around expected spheres of image files, as `find_nearby` finds them in each.
+    """Search image files for outlines around expected spheres, as `find_nearby` finds them in each.
 
     Raises:
         DataError: an image cannot be used; the message names the first one.

@@ -89,7 +89,7 @@ def detect_by_masks(
 
 
 def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULTS) -> list[Box]:
-    """Return the boxes around what may be a sphere, the most certain first."""
+    """Find the boxes around what may be a sphere, the most certain first."""
     scale = min(1.0, options.coarse_width_px / image_bgr.shape[1])
     small = image_bgr
     if scale < 1:
@@ -293,7 +293,7 @@ def detect_file_by_masks(
 
 
 def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
-    """Return the boxes by image name from a JSON file, such as Grounding DINO's.
+    """Read the boxes by image name from a JSON file, such as Grounding DINO's.
 
     Raises:
         DataError: the file is not JSON of this format, a box has no area, or an image is not among `names`.

@@ -134,7 +134,7 @@ def locate_predicted(
     expected: PredictedSpheres,
     options: DetectionOptions = DEFAULTS,
 ) -> PredictedOutlines:
-    """Return the outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
+    """Locate the outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
 
     Each region is searched as far as the prediction may be off. The outlines found must agree with one camera pose
     (the image's own, so the robot's pose may be off) in place, size and colour; spheres that do not are reported as

@@ -67,7 +67,7 @@ def refine_outline(
     rough: Cone,
     options: DetectionOptions = DEFAULTS,
 ) -> SphereOutline | None:
-    """Return the outline near `rough` at full resolution, reading only its region; None if no reliable one is found.
+    """Refine the outline near `rough` at full resolution, reading only its region; None if no reliable one is found.
 
     `rough` comes from the coarse search or from a prediction and must be good to about a tenth of the radius.
     """
@@ -138,7 +138,7 @@ def measure_outlines(
     *,
     scores: Sequence[float] = (),
 ) -> list[SphereOutline | None]:
-    """Return the outlines at full resolution from cones that are good to about a pixel; None as in `refine_outline`.
+    """Measure the outlines at full resolution from cones that are good to about a pixel; None as in `refine_outline`.
 
     The larger an outline, the more edge it has and the better it determines the sphere's position, so the number of
     profiles decreases with its size. An image of 16 bits is a developed raw file, sRGB coded.

@@ -239,7 +239,7 @@ class LoadedViews:
         self._known: OrderedDict[str, tuple[View, Picture]] = OrderedDict()
 
     def read(self, name: str) -> tuple[View, Picture]:
-        """Return a view and its picture.
+        """Read a view and its picture.
 
         Raises:
             DataError: a file cannot be read.

@@ -30,7 +30,7 @@ HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre,
 
 
 def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Transform]:
-    """Return T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
+    """Read T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
 
     Args:
         path: file or folder; its kind determines the format.
@@ -147,7 +147,7 @@ def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> 
 
 
 def read_poses_csv(path: Path) -> dict[str, Transform]:
-    """Return T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
+    """Read T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
 
     Raises:
         DataError: the file has another format; the message names file:line.
@@ -199,7 +199,7 @@ def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None
 
 
 def read_transforms_json(path: Path) -> dict[str, Transform]:
-    """Return T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
+    """Read T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
 
     Cameras look along -z, but those of NeuS2's own format and of Mitsuba along +z. Names are the frames' file_path
     without a leading "./". Where `unit_box.json` of our own export lies beside it, positions are taken back to the
@@ -312,7 +312,7 @@ def transforms_intrinsics(camera: CameraModel, *, where: str = "", remedy: str) 
 
 
 def read_colmap_model(folder: Path) -> dict[str, Transform]:
-    """Return T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
+    """Read T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
 
     Raises:
         DataError: the folder has no model, or it cannot be read.

@@ -307,7 +307,7 @@ _REMEDY = "Give the file that `orthocapture calibrate hand-eye` wrote"
 
 
 def read_hand_eye(path: Path) -> Transform:
-    """Return T_flange_camera (4, 4), metres, from a hand_eye.json.
+    """Read T_flange_camera (4, 4), metres, from a hand_eye.json.
 
     Raises:
         DataError: the file holds no valid T_flange_camera.
@@ -323,7 +323,7 @@ def read_hand_eye(path: Path) -> Transform:
 
 
 def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
-    """Return the station by image name, from a CSV with the columns image and station.
+    """Read the station by image name, from a CSV with the columns image and station.
 
     Raises:
         DataError: the columns are missing, or an image has no station.

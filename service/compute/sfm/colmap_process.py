@@ -143,7 +143,7 @@ _PER_BYTE = 40  # memory per byte of a model's files: an observation takes 24 by
 
 
 def read_model(folder: Path) -> dict[str, Transform]:
-    """Return T_world_camera (4, 4) by image name from the model in `folder`.
+    """Read T_world_camera (4, 4) by image name from the model in `folder`.
 
     Raises:
         DataError: the model cannot be read.

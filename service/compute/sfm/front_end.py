@@ -86,7 +86,7 @@ class FrontEnd:
             child.close()
 
     def extract_features(self, file: Path) -> ImageFeatures:
-        """Return the features of one image.
+        """Extract the features of one image.
 
         Raises:
             DataError: the image is missing, unreadable or of another size than the camera.

@@ -122,7 +122,7 @@ def _of_pairs(
 
 
 def triangulate(poses: Array, plane: Array, sightings: TrackedFeatures, sigma: float) -> tuple[Array, Array]:
-    """Return the scene points (P, 3) by robust triangulation from known poses, and the error of each observation.
+    """Triangulate scene points (P, 3) robustly from known poses; return the error of each observation too.
 
     First the point nearest to all rays, then Gauss–Newton steps on the reprojection errors; both use Cauchy weights,
     which favour the position on which most observations of a track agree.

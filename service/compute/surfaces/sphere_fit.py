@@ -306,7 +306,7 @@ class SphereFit:
 
 
 def fit_sphere(samples: SphereSamples, start: Array, radius: float, band: float) -> SphereFit | None:
-    """Return Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
+    """Fit a sphere of known radius (Tukey) from a centre that is good to `band`; None if too few inliers remain."""
     points, area = samples.points, samples.weight
 
     def narrowed(at: TukeyStep, half_width: float) -> float | None:

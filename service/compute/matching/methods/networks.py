@@ -87,7 +87,7 @@ def torch_with(network: str, words: str) -> Torch:
 
 
 def read_weights(torch: Torch, path: Path | None, expected: str) -> Weights:
-    """Return the weights in a local file; nothing is downloaded, and no code in the file is run.
+    """Read the weights in a local file; nothing is downloaded, and no code in the file is run.
 
     Raises:
         ConfigurationError: no file is named.
