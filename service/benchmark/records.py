@@ -67,7 +67,7 @@ class Score(Record):
 
 
 class BenchmarkResult(Record):
-    """One method in one scenario.
+    """The result of one method in one scenario.
 
     Attributes:
         method: its name.

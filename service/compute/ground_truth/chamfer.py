@@ -230,7 +230,7 @@ _PREVIEW = 10  # of so many of them, one is looked at first: a good bound makes 
 
 @dataclass(frozen=True, slots=True)
 class ChamferSettings:
-    """How two surfaces are compared; the defaults are the paper's.
+    """The settings by which two surfaces are compared; the defaults are the paper's.
 
     `to_faces`: also measure the distances to the faces, which takes most of the time with large meshes.
     `of_vertices`: also measure those of the vertices of the surface that is judged, for a heat map of it.
@@ -283,7 +283,7 @@ class DistanceSamples:
 
 @dataclass(frozen=True, slots=True)
 class ChamferScore:
-    """Two surfaces compared.
+    """The result of a comparison of two surfaces.
 
     Attributes:
         pred_to_gt: accuracy: from the surface judged to the truth.

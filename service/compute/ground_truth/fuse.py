@@ -240,7 +240,7 @@ class FusionSettings:
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """The ground truth.
+    """The fused ground-truth mesh, with the source, weight and noise of each vertex.
 
     Attributes:
         surface: the fused mesh, in the frame of the sources.

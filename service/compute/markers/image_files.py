@@ -281,7 +281,7 @@ class MapFunction(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class AnchorRegistration:
-    """The provisional registration.
+    """The provisional registration by a few images, the anchors.
 
     Attributes:
         T_scan_camera: (N, 4, 4) provisional camera poses in the scan frame.

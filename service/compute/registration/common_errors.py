@@ -66,7 +66,7 @@ class CommonError:
 
 @dataclass(frozen=True, slots=True)
 class BeyondModel:
-    """The result of the free fit.
+    """The result of the fit that leaves the errors common to all outlines free.
 
     Attributes:
         errors: the common errors as the outlines have them; empty if they do not determine them.

@@ -28,7 +28,7 @@ ContradictionKind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """One fault.
+    """A fault that the outlines show in the inputs of a registration.
 
     Attributes:
         kind: the kind of fault.

@@ -1,4 +1,4 @@
-"""From posed images to a mesh: pairs, depth maps, fusion, surface; once more, finely, near it; then what is steep."""
+"""Reconstructs a mesh from posed images: pairs, depth maps, fusion; again, finely, near it; then steep parts."""
 
 from __future__ import annotations
 

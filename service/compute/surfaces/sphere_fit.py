@@ -20,7 +20,7 @@ _STEADY = 0.5  # length of the sum of the area vectors over the sum of their len
 
 @dataclass(frozen=True, slots=True)
 class Surfels:
-    """Cells of surface.
+    """Cells of a surface, each reduced to one sample.
 
     Attributes:
         position: (N, 3) centroids.
@@ -278,7 +278,7 @@ class Patches:
 
 @dataclass(frozen=True, slots=True)
 class SphereFit:
-    """A finished fit.
+    """A finished fit of a sphere to a surface.
 
     Attributes:
         centre: (3,), m.
