@@ -136,8 +136,8 @@ def halved_gauss_newton(
     Args:
         start: initial state, with its cost and its Gauss–Newton step.
         candidate_of: the same after a share (0 … 1] of a state's step.
-        gain_of: the same as in `levenberg_marquardt`.
-        settles: the same as in `levenberg_marquardt`.
+        gain_of: decrease of the cost from a state to a candidate; minus infinity if it is not a number.
+        settles: says if the step from a state to a candidate, accepted or not, is the last.
         most: largest number of steps tried.
     """
     return levenberg_marquardt(

@@ -103,7 +103,7 @@ class Aligned:
 
     Attributes:
         T_scan_ct: (4, 4) by the spheres that did not move.
-        covariance: (6, 6) covariance of T_scan_ct, as in `evaluation.closure.Alignment`.
+        covariance: (6, 6) covariance of T_scan_ct, as in `evaluation.error_budget.Alignment`.
         loop: the spheres one by one.
         distances: their distances before (CT) and after (scan) the transport.
         only_ct: spheres, by their numbers in the CT, that are missing in the scan.

@@ -219,7 +219,7 @@ class FusionSettings:
     Attributes:
         blend_m: width of the overlap over which the weight rises.
         sigma_ct_m, sigma_scan_m: least standard deviation of each surface along its normal, as of its spheres.
-        alignment_covariance: (6, 6) covariance of T_scan_ct as in `evaluation.closure.Alignment`; None: known
+        alignment_covariance: (6, 6) covariance of T_scan_ct as in `evaluation.error_budget.Alignment`; None: known
             exactly.
         keep_scan_only: true to add parts of the scan that are missing in the CT, unconnected.
         least_part_m2: smaller unconnected parts of the CT are left out.

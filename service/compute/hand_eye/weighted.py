@@ -311,7 +311,7 @@ def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np
     visited.
 
     Args:
-        views: the same as in `solve`.
+        views: the measurements.
         noise: noise with the initial scales, in the groups of `views.kind`.
         near: the answer, approximately.
         groups: (K,) group of each parameter.
