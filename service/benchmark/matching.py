@@ -33,7 +33,7 @@ _Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """What has to be right about a pair of the list."""
+    """A pair of the list, with the fields that are checked when the list is read."""
 
     first: str
     second: str
@@ -44,7 +44,7 @@ class _Pair:
 
 @dataclass(frozen=True, slots=True)
 class MatchingTask:
-    """What is to be run.
+    """One run of a matching method: the data set, the method and where its result goes.
 
     Attributes:
         dataset: folder exported with the format `matching`.
@@ -71,7 +71,7 @@ def run_matching(wanted: MatchingTask, progress: Progress) -> list[MethodResult]
         all results, by the names of their methods.
 
     Raises:
-        ConfigurationError: what the method needs is not installed or not given.
+        ConfigurationError: the method's weights or packages are not installed or not given.
         DataError: the data set or a result in the folder cannot be read, or results are of other pairs.
     """
     data = open_matching_data(wanted.dataset)
@@ -92,7 +92,7 @@ def run_matching(wanted: MatchingTask, progress: Progress) -> list[MethodResult]
 
 
 def open_matching_data(folder: Path) -> MatchingData:
-    """The pairs of an exported data set.
+    """Return the pairs of an exported data set.
 
     Raises:
         DataError: the folder holds none.
@@ -113,7 +113,7 @@ def open_matching_data(folder: Path) -> MatchingData:
 
 
 def results_in(folder: Path) -> list[MethodResult]:
-    """The results of earlier runs in a folder.
+    """Return the results of earlier runs in a folder.
 
     Raises:
         DataError: a JSON file there is something else.
@@ -133,7 +133,7 @@ def require_same_pairs(results: Sequence[MethodResult], folder: Path) -> None:
 
 
 def _write_examples(wanted: MatchingTask, match: Match, data: MatchingData, pairs: Sequence[Pair]) -> None:
-    """The middle pair of each class, with its matches."""
+    """Draw the middle pair of each class, with its matches."""
     views = LoadedViews(data)
     for name in CLASSES:
         same = [pair for pair in pairs if pair["difficulty"] == name]
@@ -163,7 +163,7 @@ _PICTURE_WIDTH, _MOST_LINES = 900, 120
 
 
 def curves_png(results: Sequence[MethodResult]) -> bytes:
-    """Panels by class: above, the share of pairs below each pose error; below, precision by distance.
+    """Return the panels by class: above, the share of pairs below each pose error; below, precision by distance.
 
     Raises:
         ComputeError: the picture cannot be encoded.
@@ -223,7 +223,7 @@ class _Panel:
 
 
 def matches_picture(first: Picture, second: Picture, found: Matches, errors_px: Array, caption: str) -> Canvas:
-    """Both pictures with some of the matches: green within 3 px, red beyond, grey without ground truth."""
+    """Return both pictures with some of the matches: green within 3 px, red beyond, grey without ground truth."""
     scale = _PICTURE_WIDTH / first.shape[1]
     height = round(scale * max(first.shape[0], second.shape[0]))
     sides = [cv2.resize(picture, (_PICTURE_WIDTH, round(picture.shape[0] * scale))) for picture in (first, second)]
@@ -244,7 +244,7 @@ def matches_picture(first: Picture, second: Picture, found: Matches, errors_px: 
 
 
 def png(canvas: Canvas) -> bytes:
-    """The picture as a PNG file.
+    """Return the picture as a PNG file.
 
     Raises:
         ComputeError: it cannot be encoded.

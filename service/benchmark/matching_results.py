@@ -27,14 +27,14 @@ class ClassScore:
     """The score of a method on a class of pairs.
 
     Attributes:
-        name: of the class, or ALL.
+        name: the class's name, or ALL.
         pairs: number of pairs.
-        auc: of the pose error at each of THRESHOLDS_DEG.
-        precision: at each of PRECISION_PX: mean over the pairs.
+        auc: area under the curve of the pose error up to each of THRESHOLDS_DEG.
+        precision: mean precision over the pairs at each of PRECISION_PX.
         epipolar_px: median over the pairs of their medians; infinite if most have no match.
-        matches: mean number.
+        matches: mean number of matches.
         scored: share of the matches with ground truth.
-        seconds: mean for a pair.
+        seconds: mean time for a pair.
     """
 
     name: str
@@ -49,13 +49,13 @@ class ClassScore:
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """What a method scored.
+    """The scores of one method on every pair of a list.
 
     Attributes:
         method, words: its name, and what it is called in tables.
-        dataset_sha256: of the list of pairs.
+        dataset_sha256: SHA-256 of the list of pairs.
         simulated: no camera was in front of a specimen.
-        scores: of the pairs.
+        scores: one score for each pair.
     """
 
     method: str
@@ -72,7 +72,7 @@ class MethodResult:
 
 
 def class_score(name: str, scores: Sequence[PairScore]) -> ClassScore:
-    """The score of some pairs, at least one."""
+    """Return the score of some pairs, at least one."""
     worst = [score.pose.worst_deg for score in scores]
     matches = sum(score.matches for score in scores)
     return ClassScore(
@@ -88,7 +88,7 @@ def class_score(name: str, scores: Sequence[PairScore]) -> ClassScore:
 
 
 def result_of(how: Matcher, folder: Path, data: MatchingData, scores: Sequence[PairScore]) -> MethodResult:
-    """The result of a method on the data set in a folder."""
+    """Return the result of a method on the data set in a folder."""
     sha256 = hashlib.sha256((folder / "pairs.json").read_bytes()).hexdigest()
     return MethodResult(how.name, how.words, sha256, data.simulated, tuple(scores))
 
@@ -128,7 +128,7 @@ class _ResultRecord(_Record):
 
 
 def record(result: MethodResult) -> dict[str, Any]:
-    """The result as plain data; infinite numbers become null."""
+    """Return the result as plain data; infinite numbers become null."""
     pairs = [
         {
             "first": score.first,
@@ -156,7 +156,7 @@ def record(result: MethodResult) -> dict[str, Any]:
 
 
 def read_result(path: Path) -> MethodResult:
-    """A result as `record` wrote it.
+    """Read a result as `record` wrote it.
 
     Raises:
         DataError: the file is something else.
@@ -230,7 +230,7 @@ Epipolar: median over the pairs of the median distance from the epipolar lines."
 
 
 def rows(results: Sequence[MethodResult]) -> list[tuple[str, ...]]:
-    """Rows below HEADER: each method on each class of pairs."""
+    """Return the rows below HEADER: each method on each class of pairs."""
     return [(result.method, *_cells(one)) for result in results for one in result.classes]
 
 
@@ -248,7 +248,7 @@ def _cells(one: ClassScore) -> tuple[str, ...]:
 
 
 def markdown(results: Sequence[MethodResult]) -> str:
-    """The table as Markdown, with what its columns mean."""
+    """Return the table as Markdown, with what its columns mean."""
     lines = ["| " + " | ".join(HEADER) + " |", "|---|---|" + "---:|" * (len(HEADER) - 2)]
     lines += ["| " + " | ".join(row) + " |" for row in rows(results)]
     names = "\n".join(f"- `{result.method}`: {result.words}" for result in results)

@@ -26,7 +26,7 @@ Command = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Workplace:
-    """Where a method works.
+    """The folders and the interpreter with which a method works.
 
     Attributes:
         data: folder with the exported data set, which the method reads.
@@ -46,16 +46,16 @@ class Method:
     """A method of reconstruction.
 
     Attributes:
-        name: as it is named on the command line.
-        words: what it is called in the table.
+        name: its name on the command line.
+        words: its label in the table.
         expects: program and version that the commands are written for, and what it needs.
         form: name of the export format that it reads.
-        commands: what is run, one after the other; a pure function of the place.
+        commands: the commands to run, one after the other; a pure function of the place.
         mesh: finds the mesh that the commands left. Raises DataError if there is none.
         to_world: transforms vertices (V, 3) of that mesh to the world frame, m; it may read the exported folder. Most
             methods' meshes are in the world frame already.
-        programs: looked for on the path.
-        variable: of the environment, with the folder of its source code; "" if it needs none.
+        programs: programs that are looked for on the path.
+        variable: the environment variable with the folder of its source code; "" if it needs none.
         lacking: says what else is missing to run it on this machine; "" if nothing is.
     """
 
@@ -72,7 +72,7 @@ class Method:
 
 
 def methods() -> dict[str, Method]:
-    """Every method by its name.
+    """Return every method by its name.
 
     Raises:
         ConfigurationError: two have the same name, or an entry point names something else.
@@ -81,7 +81,7 @@ def methods() -> dict[str, Method]:
 
 
 def method_named(name: str) -> Method:
-    """The method of this name.
+    """Return the method of this name.
 
     Raises:
         ConfigurationError: there is none.
@@ -90,7 +90,7 @@ def method_named(name: str) -> Method:
 
 
 def missing(method: Method, environment: Mapping[str, str] = os.environ) -> str:
-    """What is missing to run a method here, in words; "" if it can be run."""
+    """Describe what is missing to run a method here; "" if it can be run."""
     lacks = [program for program in method.programs if shutil.which(program, path=environment.get("PATH")) is None]
     if lacks:
         return f"{', '.join(lacks)} not found on the path"
@@ -102,7 +102,7 @@ def missing(method: Method, environment: Mapping[str, str] = os.environ) -> str:
 
 
 def place_of(method: Method, folder: Path, environment: Mapping[str, str] = os.environ) -> Workplace:
-    """Where a method works below a folder: `data` and `work`, with its checkout and interpreter.
+    """Return a method's places below a folder: `data` and `work`, with its checkout and interpreter.
 
     `VARIABLE_PYTHON` names the interpreter of a checkout with an environment of its own, `python` is the default;
     methods without a checkout run in this program's.
@@ -124,12 +124,12 @@ _SUGAR_ITERATIONS = "7000"
 
 
 def at(name: str) -> Callable[[Workplace], Path]:
-    """A mesh of this name in the method's folder."""
+    """Return a mesh of this name in the method's folder."""
     return newest(name)
 
 
 def newest(pattern: str) -> Callable[[Workplace], Path]:
-    """The youngest of the files in the method's folder that match a pattern."""
+    """Return the youngest of the files in the method's folder that match a pattern."""
 
     def find(place: Workplace) -> Path:
         found = [path for path in place.work.glob(pattern) if path.is_file()]
@@ -143,14 +143,14 @@ def newest(pattern: str) -> Callable[[Workplace], Path]:
 
 
 class _UnitBox(BaseModel):
-    """What is read of it."""
+    """The fields of `unit_box.json` that the benchmark reads."""
 
     mesh_axes: tuple[_Axis, _Axis, _Axis]
     centre_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 def from_unit_box(vertices: Array, data: Path) -> Array:
-    """World points (N, 3), in metres, of a mesh that was made from an export with `unit_box.json` in its folder.
+    """Return world points (N, 3), in metres, of a mesh made from an export with `unit_box.json` in its folder.
 
     Raises:
         DataError: the file is not what the export wrote.
@@ -166,7 +166,7 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
 
 
 def triangulation(place: Workplace, dense: Path) -> Command:
-    """The command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
+    """Return our command that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
     return (place.python, "-m", "service.benchmark.programs.colmap", "triangulate", str(place.data), str(dense))
 
 

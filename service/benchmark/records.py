@@ -1,4 +1,4 @@
-"""What is kept of a run of the benchmark: one record for each method and scenario, as JSON."""
+"""The stored result of a run of the benchmark: one record for each method and scenario, as JSON."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCENARIOS: tuple[Scenario, ...] = ("dense", "sparse")
 
 
 class Machine(Record):
-    """What a method ran on."""
+    """The machine on which a method ran."""
 
     processor: str
     cores: int
@@ -30,7 +30,7 @@ class ComputingEffort(Record):
     Attributes:
         wall_s: seconds on the clock.
         cpu_s: processor seconds of all processes.
-        peak_memory_mb: of the largest process, in main memory.
+        peak_memory_mb: largest main memory of any one process, MB.
     """
 
     wall_s: float
@@ -42,12 +42,12 @@ class Score(Record):
     """A mesh compared with the truth: the paper's Chamfer distance and what belongs to it.
 
     Attributes:
-        chamfer_mm: mean of the next two.
+        chamfer_mm: mean of accuracy and completeness.
         accuracy_mm, completeness_mm: mean distances from mesh to truth, and from truth to mesh.
-        floor_mm: what `chamfer_mm` would be, by sampling alone, if both were equal.
-        spacing_mm: of the samples.
-        f_score_05, f_score_10: at 0.5 mm and 1 mm.
-        normal_consistency: mean cosine between the normals, of both directions.
+        floor_mm: the `chamfer_mm` that sampling alone would give if both were equal.
+        spacing_mm: distance between the samples.
+        f_score_05, f_score_10: F-scores at 0.5 mm and 1 mm.
+        normal_consistency: mean cosine between the normals, averaged over both directions.
         outside_percent: share of the mesh's area that was cut off because it is outside the box of the truth.
         excluded_percent: share of the samples farther than 20 mm, which are in no mean.
         seen_percent: share of the truth within 1 mm of the mesh.
@@ -67,24 +67,24 @@ class Score(Record):
 
 
 class BenchmarkResult(Record):
-    """One method in one scenario.
+    """The result of one method in one scenario.
 
     Attributes:
         method: its name.
-        scenario: which split of the data set it was given.
-        dataset_sha256: of the data set's list of checksums.
+        scenario: the split of the data set that the method was given.
+        dataset_sha256: SHA-256 of the data set's list of checksums.
         simulated: the data set was made by a simulated rig.
         views: number of images.
-        width, height: of the first image, in pixels.
-        commands: what was run; for a mesh made elsewhere, what should have been.
+        width, height: size of the first image in pixels.
+        commands: the commands that were run; for a mesh made elsewhere, those that should have been.
         elsewhere: the mesh was made elsewhere.
         effort: None if the mesh was made elsewhere.
-        mesh_sha256: of the method's own file; "" if it made none.
-        faces: of that mesh.
+        mesh_sha256: SHA-256 of the method's own mesh file; "" if it made none.
+        faces: number of faces of that mesh.
         score: None if the method made no mesh.
-        failure: why there is no mesh, in words.
-        machine: on which it ran and was scored.
-        finished_utc: when.
+        failure: the reason why there is no mesh.
+        machine: the machine on which it ran and was scored.
+        finished_utc: time of its end, UTC.
     """
 
     method: str
@@ -106,7 +106,7 @@ class BenchmarkResult(Record):
 
 
 def read_results(out: Path) -> tuple[BenchmarkResult, ...]:
-    """All results in a folder, by name of their folders.
+    """Read all results in a folder, by name of their folders.
 
     Raises:
         DataError: a file is not a result.

@@ -86,7 +86,7 @@ def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
 
 
 def this_machine() -> Machine:
-    """The machine that this program runs on."""
+    """Return the machine that this program runs on."""
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -118,15 +118,15 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What is to be run.
+    """One run of a method on one split of the data set, and its settings.
 
     Attributes:
-        method: of reconstruction.
+        method: the method of reconstruction.
         scenario: the split of the data set that it gets.
         out: folder of all results.
-        mesh: made elsewhere, as the method writes it; None to run the method here.
-        width: of the images in pixels; 0 for that of the data set.
-        settings: of the comparison.
+        mesh: a mesh made elsewhere, as the method writes it; None to run the method here.
+        width: the images' width in pixels; 0 for that of the data set.
+        settings: the settings of the comparison.
     """
 
     method: Method
@@ -138,22 +138,22 @@ class Trial:
 
     @property
     def folder(self) -> Path:
-        """Where its export, its mesh and its result are."""
+        """The folder of its export, its mesh and its result."""
         return self.out / f"{self.method.name}-{self.scenario}"
 
 
 def run_trial(
     trial: Trial, whole: DataSet, progress: Progress = lambda _what, _done, _total: None
 ) -> BenchmarkResult:
-    """Run a method, or take its mesh, and score that; the result is kept in the trial's folder.
+    """Run a method, or take its mesh, and score that; the result is stored in the trial's folder.
 
     A method that is installed and makes no mesh has a result without a score, as COLMAP in the paper's sparse
     scenario.
 
     Args:
-        trial: what to run.
+        trial: the run.
         whole: the data set, as `data_set_of_folder` reads it.
-        progress: called with what is being done.
+        progress: called with a text of what is being done.
 
     Raises:
         ConfigurationError: the method is not installed; what it reads has been exported, and the message has its
@@ -198,7 +198,7 @@ def run_trial(
 
 
 def truth_file(out: Path, dataset_sha256: str) -> Path:
-    """The ground truth of a data set, which is kept beside the results for the figure."""
+    """Return the path of a data set's ground truth, which is stored beside the results for the figure."""
     return out / f"truth-{dataset_sha256[:12]}.ply"
 
 
@@ -230,7 +230,7 @@ def _require_installed(trial: Trial, commands: tuple[Command, ...]) -> None:
 def _mesh(
     trial: Trial, place: Workplace, commands: tuple[Command, ...], progress: Progress
 ) -> tuple[Path | None, ComputingEffort | None, str]:
-    """The mesh given or made, what it took to make it, and why there is none."""
+    """Return the mesh given or made, what it took to make it, and why there is none."""
     if trial.mesh is not None:
         return trial.mesh, None, ""
     _require_installed(trial, commands)

@@ -55,14 +55,14 @@ def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = N
 
 
 def _box_around(mesh: Mesh, margin_m: float) -> Box:
-    """The smallest box around a mesh, and a margin."""
+    """Return the smallest box around a mesh, and a margin."""
     points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
     to_origin, extents = trimesh.bounds.oriented_bounds(points)
     return Box(inverse(np.asarray(to_origin)), np.asarray(extents) + 2 * margin_m)
 
 
 def _cropped(surface: Surface, box: Box) -> Surface:
-    """The faces whose centres are in a box."""
+    """Return the faces whose centres are in a box."""
     within = np.empty(len(surface.faces), dtype=np.bool_)
     for block in surface.blocks():
         within[block] = box.contains(surface.vertices_m[surface.faces[block]].mean(axis=1))
@@ -76,9 +76,9 @@ def compare(
 
     Args:
         cut: the mesh without what the truth does not cover.
-        truth: what it is compared with.
-        settings: of the comparison.
-        outside_percent: of the method's surface, that was cut off before.
+        truth: the mesh that it is compared with.
+        settings: the settings of the comparison.
+        outside_percent: share of the method's surface that was cut off before.
 
     Raises:
         ComputeError: the meshes cannot be compared.

@@ -27,7 +27,7 @@ _NONE = "–"
 
 
 def table_record(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> dict[str, Any]:
-    """All results; for each method without a result, what is missing, what it expects, and its commands."""
+    """Return all results; for each method without a result, what is missing, what it expects, and its commands."""
     done = {(result.method, result.scenario) for result in results}
     return {
         "results": [result.model_dump(mode="json") for result in results],
@@ -165,7 +165,7 @@ def _not_run(entries: Sequence[Mapping[str, Any]], known: Mapping[str, Method]) 
 
 
 def _named(method: Method) -> Workplace:
-    """A place with names instead of folders, for commands that are only shown."""
+    """Return a place with names instead of folders, for commands that are only shown."""
     checkout = f"${method.variable}" if method.variable else ""
     return Workplace(Path("DATA"), Path("WORK"), Path(checkout), "python")
 
@@ -180,11 +180,11 @@ _PANEL_PX = 520
 
 
 def figure(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> NDArray[np.uint8]:
-    """(H, W, 3) picture, blue first: a row for each scenario and a column for each method, of the newest data set.
+    """Draw (H, W, 3), blue first: a row for each scenario and a column for each method, of the newest data set.
 
     Args:
         out: folder of the results, with the meshes as they were scored and the truth.
-        results: from that folder.
+        results: the results in that folder.
         known: the methods.
 
     Raises:
@@ -211,12 +211,12 @@ def figure(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Me
 
 
 def figure_png(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> bytes:
-    """The figure as PNG; raises as `figure`."""
+    """Return the figure as PNG; raises as `figure`."""
     return png(figure(out, results, known), SIMULATED if _newest(out, results).simulated else "")
 
 
 def _newest(out: Path, results: Sequence[BenchmarkResult]) -> BenchmarkResult:
-    """The newest result with a mesh."""
+    """Return the newest result with a mesh."""
     scored = [result for result in results if result.score is not None]
     if not scored:
         raise DataError("no method has a mesh yet", where=str(out), remedy="Run a method with `benchmark run`")

@@ -60,7 +60,7 @@ class CorrectedMounting:
     T_flange_camera: Transform
 
     def T_base_camera(self, joints_rad: Array, T_base_flange: Array) -> Array:
-        """(N, 4, 4) camera poses from joints (N, J) and reported poses (N, 4, 4).
+        """Return (N, 4, 4) camera poses from joints (N, J) and reported poses (N, 4, 4).
 
         Raises:
             DataError: joints and poses of another arm.
@@ -69,12 +69,12 @@ class CorrectedMounting:
 
 
 def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction: ArmCorrection) -> Array:
-    """The arm's true poses: reported poses times the difference between corrected and nominal kinematics.
+    """Return the arm's true poses: reported poses times the difference between corrected and nominal kinematics.
 
     Args:
         joints_rad: (J,) or (N, J) as reported by the controller.
         T_base_flange: (4, 4) or (N, 4, 4) as reported by the controller.
-        correction: from a hand-eye calibration of the same arm.
+        correction: the correction estimated by a hand-eye calibration of the same arm.
 
     Returns:
         Corrected poses in the shape of `T_base_flange`.
@@ -100,7 +100,7 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
 
 
 def _real(arm: ArmModel, joints_rad: Array, correction: ArmCorrection) -> Array:
-    """(N, J, 4 or 5) a, d, α, θ and, where an axis needs it, β of the arm as it is built, at joints (N, J)."""
+    """Return (N, J, 4 or 5) a, d, α, θ and, where an axis needs it, β of the arm as it is built, at joints (N, J)."""
     phase = joints_rad[:, :, None] * np.arange(1, correction.gear_cos_rad.shape[1] + 1)
     gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
     real = np.zeros((*joints_rad.shape, 5))
@@ -126,22 +126,22 @@ def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
 
 
 def dh_count(arm: ArmModel) -> int:
-    """How many parameters the geometry of an arm has in `correction_design`."""
+    """Return how many parameters the geometry of an arm has in `correction_design`."""
     return 4 * arm.axes + len(arm.parallel)
 
 
 def gear_count(arm: ArmModel) -> int:
-    """How many parameters the gears of an arm have in `correction_design`."""
+    """Return how many parameters the gears of an arm have in `correction_design`."""
     return arm.axes * 2 * arm.tolerances.harmonics
 
 
 def dh_joints(arm: ArmModel) -> NDArray[np.int64]:
-    """(`dh_count`,) joint of each parameter of the geometry, from 0."""
+    """Return (`dh_count`,) joint of each parameter of the geometry, from 0."""
     return np.concatenate([np.repeat(np.arange(arm.axes), 4), np.array(arm.parallel, dtype=np.int64)])
 
 
 def correction_design(arm: ArmModel, joints_rad: Array, about: ArmCorrection) -> Array:
-    """(N, 6, `dh_count` + `gear_count`) derivative of the flange's pose by all parameters, in units of tolerances.
+    """Return (N, 6, `dh_count` + `gear_count`) derivative of the flange's pose by all parameters, in tolerances.
 
     Columns: DH deltas joint by joint (a, d, α, θ), β of those that have it, then for each joint cos(k q), then
     sin(k q), k = 1 … `harmonics`. It is taken for the arm with the errors `about`: twists of half a degree are so
@@ -157,10 +157,10 @@ def correction_design(arm: ArmModel, joints_rad: Array, about: ArmCorrection) ->
 
 
 def _dh_tolerances(arm: ArmModel) -> Array:
-    """(`dh_count`,) one standard deviation of each parameter of the geometry.
+    """Return (`dh_count`,) one standard deviation of each parameter of the geometry.
 
-    Those of the last joint are zero: its errors move the camera with the flange, and nothing can tell them from
-    another mount of the camera. They stay in T_flange_camera, for whose purpose they are no errors.
+    Those of the last joint are zero: its errors move the camera with the flange, and nothing can distinguish them
+    from another mount of the camera. They stay in T_flange_camera, for whose purpose they are no errors.
     """
     of = np.tile(arm.tolerances.dh, (arm.axes, 1))
     if arm.tolerances.lengths_m:
@@ -172,7 +172,7 @@ def _dh_tolerances(arm: ArmModel) -> Array:
 
 
 def correction_of(arm: ArmModel, scaled: Array, observed: Array) -> ArmCorrection:
-    """The correction from scaled parameters in the order of `correction_design`, those of the gears or without."""
+    """Return the correction from scaled parameters in the order of `correction_design`, with or without the gears."""
     count, of = dh_count(arm), arm.tolerances
     waves = np.zeros(gear_count(arm))
     waves[: len(scaled) - count] = scaled[count:]

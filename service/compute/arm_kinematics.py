@@ -20,13 +20,13 @@ _SAME_TOOL_M, _SAME_TOOL_RAD = 0.01, 0.01  # between the tools of most poses, if
 
 
 def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:
-    """The arm whose forward kinematics fit the reported poses best; None if none is within `within_m`.
+    """Return the arm whose forward kinematics fit the reported poses best; None if none is within `within_m`.
 
     Of arms with the same dimensions, such as KUKA's LBR iiwa 14 and LBR Med 14, it is the first.
 
     Args:
         joints_rad: (N, J); only arms of J axes are considered.
-        T_base_flange: (N, 4, 4) as reported by the controller with the tool centre point at the flange.
+        T_base_flange: (N, 4, 4) poses as the controller reports them with the tool centre point at the flange.
         within_m: largest accepted median distance of the positions.
     """
     best, best_m = None, within_m
@@ -39,11 +39,11 @@ def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0
 
 
 def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transform] | None:
-    """The arm and its tool T_flange_tool whose poses these are; None if no known arm with one fixed tool has them.
+    """Find the arm and its tool T_flange_tool with these poses; None if no known arm with one fixed tool has them.
 
     Args:
-        joints_rad: (N, J).
-        T_base_tool: (N, 4, 4) as reported by a controller with an active tool centre point.
+        joints_rad: (N, J) joint angles.
+        T_base_tool: (N, 4, 4) poses as a controller with an active tool centre point reports them.
     """
     best: tuple[float, ArmModel, Transform] | None = None
     for arm in (arm for arm in known_arms() if arm.axes == joints_rad.shape[1]):
@@ -57,7 +57,7 @@ def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transf
 
 
 def chain(values: Array) -> Array:
-    """(N, J + 1, 4, 4) T_base_0 … T_base_J from values (N, J, 4 or 5) in the order a, d, α, θ and, if given, β.
+    """Return (N, J + 1, 4, 4) T_base_0 … T_base_J from values (N, J, 4 or 5) in the order a, d, α, θ and any β.
 
     T_(i-1)_i = Rz(θ) Tz(d) Tx(a) Ry(β) Rx(α).
     """
@@ -86,17 +86,17 @@ def chain(values: Array) -> Array:
 
 
 def forward(arm: ArmModel, joints_rad: Array) -> Array:
-    """(N, 4, 4) T_base_flange at joints (N, J) with the nominal parameters."""
+    """Return (N, 4, 4) T_base_flange at joints (N, J) with the nominal parameters."""
     return chain(arm.joint_values(_joints(arm, joints_rad)))[:, -1]
 
 
 def dh_jacobian(frames: Array) -> Array:
-    """(N, 6, 4 J) derivative of the flange's pose by a, d, α, θ of joint 1, of joint 2, …
+    """Return (N, 6, 4 J) derivative of the flange's pose by a, d, α, θ of joint 1, of joint 2, …
 
     The pose increment is (d in metres, w in radians) in the flange's axes, about its origin.
 
     Args:
-        frames: (N, J + 1, 4, 4) as from `chain`.
+        frames: (N, J + 1, 4, 4) frames from `chain`.
     """
     axes = frames.shape[1] - 1
     R_flange, flange = frames[:, -1, :3, :3], frames[:, -1, :3, 3]
@@ -118,11 +118,11 @@ def dh_jacobian(frames: Array) -> Array:
 
 
 def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:
-    """(N, 6, K) derivative of the flange's pose by β of K joints, in the form of `dh_jacobian`.
+    """Return the (N, 6, K) derivative of the flange's pose by β of K joints, in the format of `dh_jacobian`.
 
     Args:
-        frames: (N, J + 1, 4, 4) as from `chain`.
-        joints: of the axes to which the next is parallel, from 0.
+        frames: (N, J + 1, 4, 4) frames from `chain`.
+        joints: indices, from 0, of the axes to which the next axis is parallel.
     """
     flange = frames[:, -1, :3, 3]
     to_flange = np.swapaxes(frames[:, -1, :3, :3], 1, 2)
@@ -135,7 +135,7 @@ def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:
 
 
 def solve_joints(arm: ArmModel, T_base_flange: Transform, starts_rad: Array) -> Array | None:
-    """Joints (J,) that reach a pose, by damped Newton steps from each start (S, J) in turn; None if none converges.
+    """Find joints (J,) that reach a pose, by damped Newton steps from each start (S, J) in turn; None if none does.
 
     The result is within the limits. For planning only: whether the arm reaches the pose in a posture near the starts.
     Every step is taken with the same damping, since on a long way round the error may grow for a while.
@@ -174,7 +174,7 @@ class _Reach:
 
 
 def pose_gap(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> tuple[float, float]:
-    """Median distance (m) and angle (rad) between forward kinematics and the reported poses (N, 4, 4).
+    """Return the median distance (m) and angle (rad) between forward kinematics and the reported poses (N, 4, 4).
 
     Raises:
         DataError: the numbers of joints and poses differ.
@@ -201,7 +201,7 @@ _WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.25])
 
 
 def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
-    """Joints (K, N) within ±180° and the limits that reach a pose; an empty array if there are none.
+    """Return the joints (K, N) within ±180° and the limits that reach a pose; an empty array if there are none.
 
     Up to eight for six axes; for seven, those of elbow angles all round.
     """
@@ -212,7 +212,7 @@ def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
 
 
 def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
-    """Joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
+    """Return the joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
 
     The turn of the last of six axes counts half. With seven axes nearness is weighed against room to limits and
     singularities.
@@ -227,13 +227,13 @@ def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> A
 
 
 def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
-    """The first of `postures_near`; None if the pose is out of reach."""
+    """Return the first of `postures_near`; None if the pose is out of reach."""
     found = postures_near(arm, T_base_flange, near_rad)
     return found[0] if len(found) else None
 
 
 def _universal_robot(arm: ArmModel, T_base_flange: Transform) -> Array:
-    """Joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
+    """Return the joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
 
     The eight are shoulder left or right, wrist up or down, elbow up or down. Where the last axis is parallel to the
     second, its angle is free and taken as 0.

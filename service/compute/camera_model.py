@@ -41,12 +41,12 @@ class CameraModel:
 
     @classmethod
     def from_record(cls, record: Mapping[str, float]) -> CameraModel:
-        """The camera of a recorded result: its fields by name; the image size may be floats."""
+        """Return the camera of a recorded result: its fields by name; the image size may be floats."""
         rest = {name: value for name, value in record.items() if name not in ("width", "height")}
         return cls(int(record["width"]), int(record["height"]), **rest)
 
     def record(self) -> dict[str, float]:
-        """The camera as `from_record` reads it; k3 … k6 only if one of them is not zero."""
+        """Return the camera as `from_record` reads it; k3 … k6 only if one of them is not zero."""
         fields = dataclasses.asdict(self)
         return {name: value for name, value in fields.items() if name not in _OPTIONAL or value != 0}
 
@@ -62,7 +62,7 @@ class CameraModel:
         return terms if terms[5:].any() else terms[:5] if self.k3 else terms[:4]
 
     def project(self, points_camera: Array) -> Array:
-        """Distorted pixels (N, 2) of points (N, 3) in the camera frame."""
+        """Return the distorted pixels (N, 2) of points (N, 3) in the camera frame."""
         xy = points_camera[:, :2] / points_camera[:, 2:]
         r2 = np.sum(xy**2, axis=1)
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -73,7 +73,7 @@ class CameraModel:
         return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=1)
 
     def normalise(self, pixels: Array) -> Array:
-        """Undistorted normalised coordinates (N, 2), at z = 1, of distorted pixels (N, 2)."""
+        """Return the undistorted normalised coordinates (N, 2), at z = 1, of distorted pixels (N, 2)."""
         import cv2  # noqa: PLC0415 - reading a record of a camera does not need it
 
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
@@ -82,7 +82,7 @@ class CameraModel:
         return np.asarray(out, dtype=np.float64).reshape(-1, 2)
 
     def scaled(self, width: int, height: int) -> CameraModel:
-        """The camera at another image size; pixel centres stay at integers, so c' = (c + ½) s − ½."""
+        """Return the camera at another image size; pixel centres stay at integers, so c' = (c + ½) s − ½."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
             self,
@@ -107,7 +107,7 @@ class CameraCovariance:
     matrix: Array
 
     def of_lens(self) -> Array | None:
-        """(8, 8) covariance of the parameters LENS; None if the covariance is of another lens model."""
+        """Return (8, 8) covariance of the parameters LENS; None if the covariance is of another lens model."""
         if not set(self.parameters) <= set(LENS):
             return None
         # Parameters that the model holds fixed are exact, but the solver needs a positive variance.
@@ -117,7 +117,7 @@ class CameraCovariance:
         return out
 
     def deviations(self, camera: CameraModel) -> Iterator[CameraModel]:
-        """Cameras displaced by one standard deviation along each principal axis of the covariance.
+        """Yield the cameras displaced by one standard deviation along each principal axis of the covariance.
 
         The outer products of the changes that they cause in a result add up to the camera's share of its covariance.
         """
@@ -131,7 +131,7 @@ class CameraCovariance:
 
 
 def read_camera_covariance(path: Path) -> CameraCovariance | None:
-    """The covariance that `calibrate intrinsics` wrote into camera.json; None if the file has none.
+    """Read the covariance that `calibrate intrinsics` wrote into camera.json; None if the file has none.
 
     Raises:
         DataError: the file is not JSON, or its `covariance` is malformed.

@@ -19,7 +19,7 @@ StateT = TypeVar("StateT")
 
 
 def largest(step: Array) -> float:
-    """Largest absolute coordinate of a step."""
+    """Return the largest absolute coordinate of a step."""
     return float(np.abs(step).max())
 
 
@@ -32,7 +32,7 @@ def gauss_newton(
     settled: float,
     size: Callable[[StateT, Array], float] = lambda _state, step: largest(step),
 ) -> StateT:
-    """Gauss–Newton: stop after a step smaller than `settled`, or after `most` steps, and return the state.
+    """Take Gauss–Newton steps until one is smaller than `settled`, or `most` are done, and return the state.
 
     Args:
         start: initial state, near the minimum.
@@ -72,8 +72,8 @@ class Descent(Generic[StateT]):
     Attributes:
         state: the best state found.
         steps: number of steps tried.
-        settled: whether a step settled, before the steps ran out or none helped any more.
-        stuck: whether the damping exceeded its limit, because no step helped any more.
+        settled: true if a step settled, before the steps ran out or none helped any more.
+        stuck: true if the damping exceeded its limit, because no step helped any more.
     """
 
     state: StateT
@@ -98,7 +98,7 @@ def levenberg_marquardt(
         start: initial state, with its linearisation and cost.
         candidate_of: the linearised state after a step from a state with a given damping.
         gain_of: decrease of the cost from a state to a candidate; minus infinity if it is not a number.
-        settles: whether the step from a state to a candidate, accepted or not, is the last.
+        settles: says if the step from a state to a candidate, accepted or not, is the last.
         damping: its schedule.
         most: largest number of steps tried.
         renewed: updates an accepted state's weights or other parts of its cost; None: nothing is updated.
@@ -128,7 +128,7 @@ def halved_gauss_newton(
     *,
     most: int,
 ) -> Descent[StateT]:
-    """Gauss–Newton that halves a step, down to a thousandth, as long as it would increase the cost.
+    """Take Gauss–Newton steps, each halved, down to a thousandth, as long as it would increase the cost.
 
     It is `levenberg_marquardt` with the step's divisor in place of the damping. Where some unknowns are eliminated
     with a covariance of their own, damping would not shorten all in proportion.
@@ -136,8 +136,8 @@ def halved_gauss_newton(
     Args:
         start: initial state, with its cost and its Gauss–Newton step.
         candidate_of: the same after a share (0 … 1] of a state's step.
-        gain_of: as for `levenberg_marquardt`.
-        settles: as for `levenberg_marquardt`.
+        gain_of: decrease of the cost from a state to a candidate; minus infinity if it is not a number.
+        settles: says if the step from a state to a candidate, accepted or not, is the last.
         most: largest number of steps tried.
     """
     return levenberg_marquardt(

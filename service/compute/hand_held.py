@@ -43,9 +43,9 @@ class HandView:
     """The result of looking at one image.
 
     Attributes:
-        T_scene_camera: (4, 4) in the spheres' frame; None if the spheres do not determine it.
-        information: about the scan's pose relative to the camera; None without a pose.
-        why: why the image is unusable; empty if it is good.
+        T_scene_camera: (4, 4) camera pose in the spheres' frame; None if the spheres do not determine it.
+        information: information about the scan's pose relative to the camera; None without a pose.
+        why: the reason why the image is unusable; empty if it is good.
         shown: outlines by sphere.
     """
 
@@ -73,7 +73,7 @@ def look_at_image(
     """Search a whole image (H, W, 3) for the spheres (M, 3), without a predicted camera pose.
 
     Args:
-        rough: whether the sphere centres come from photographs alone; they and the camera pose are then only good to
+        rough: true if the sphere centres come from photographs alone; they and the camera pose are then only good to
             some millimetres.
     """
     outlines = detect_spheres(image_bgr, camera, options)
@@ -113,7 +113,7 @@ def look_at_image(
 def _read(
     outlines: Sequence[SphereOutline], camera: CameraModel, spheres_m: Array, radius_m: float
 ) -> Transform | None:
-    """T_camera_scene from the assignment on which the spheres agree; None if there is none."""
+    """Return T_camera_scene from the assignment on which the spheres agree; None if there is none."""
     if len(outlines) < _LEAST_SPHERES:
         return None
     try:
@@ -124,7 +124,7 @@ def _read(
 
 
 def _rough_pose(outlines: Sequence[SphereOutline], spheres_m: Array, radius_m: float) -> Transform | None:
-    """T_camera_scene by matching the spheres' positions in this image alone with those from other photographs."""
+    """Find T_camera_scene by matching the spheres' positions in this image with those from other photographs."""
     places = places_by_size([outline.cone for outline in outlines], radius_m)
     if len(places) < _LEAST_SPHERES:
         return None
@@ -141,7 +141,7 @@ def pose_by_spheres(
     spheres_m: Array,
     radius_m: float,
 ) -> tuple[Transform | None, dict[int, int]]:
-    """T_camera_scene of one image and outline → sphere; None and {} if fewer than four spheres (M, 3) agree."""
+    """Find T_camera_scene of an image and outline → sphere; None and {} if fewer than four spheres (M, 3) agree."""
     if start is None:
         return None, {}
     markers = paired(outlines, start, spheres_m, radius_m, camera)
@@ -153,7 +153,7 @@ def pose_by_spheres(
 
 
 def _fault(edge_px: float, seen: int, expected: int) -> str:
-    """What is wrong with an image whose camera pose is known; empty if nothing."""
+    """Describe what is wrong with an image whose camera pose is known; empty if nothing."""
     if edge_px > _MOST_EDGE_PX:
         return f"blurred: outlines are {edge_px:.1f} px wide; hold the camera still"
     if expected >= _LEAST_SPHERES and seen < _LEAST_SHARE * expected:
@@ -171,12 +171,12 @@ def _exposure(image_bgr: NDArray[np.uint8], clipped: float) -> str:
 def poses_by_spheres(
     outlines: Sequence[Sequence[SphereOutline]], names: Sequence[str], camera: CameraModel, spheres: ScanSpheres
 ) -> dict[str, Transform]:
-    """T_scan_camera of every image whose spheres determine it, by its name; each from its own image.
+    """Compute T_scan_camera, (4, 4), of every image whose spheres determine it, by its name; each from its own image.
 
     Args:
-        outlines: of N images, each searched whole.
-        names: of the N images.
-        camera: of the images.
+        outlines: the outlines of N images, each searched whole.
+        names: the names of the N images.
+        camera: the camera of the images.
         spheres: the registration spheres.
 
     Raises:
@@ -206,7 +206,7 @@ class ImageReading:
 
     @classmethod
     def of(cls, viewpoint: str, T_scene_camera: Transform, shown: Mapping[int, SphereOutline]) -> ImageReading:
-        """From an image's outlines by sphere."""
+        """Build the reading from an image's outlines by sphere."""
         outlines = list(shown.values())
         return cls(
             viewpoint,
@@ -218,7 +218,7 @@ class ImageReading:
         )
 
     def of_spheres(self, numbers: NDArray[np.int64]) -> ImageReading:
-        """The reading with these spheres only."""
+        """Return the reading with these spheres only."""
         kept = np.isin(self.spheres, numbers)
         return replace(
             self,
@@ -229,7 +229,7 @@ class ImageReading:
         )
 
     def record(self) -> dict[str, Any]:
-        """The reading as plain data, as `read` takes it."""
+        """Return the reading as plain data, as `read` takes it."""
         return {
             "spheres": self.spheres.tolist(),
             "axes": self.axes.tolist(),
@@ -250,7 +250,7 @@ class ImageReading:
         )
 
     def photograph(self, camera: CameraModel) -> SpherePhotograph:
-        """The reading as input of the adjustment."""
+        """Return the reading as input of the adjustment."""
         cones = tuple(Cone(axis, float(half)) for axis, half in zip(self.axes, self.half_angles_rad, strict=True))
         return SpherePhotograph(camera, cones, self.covariances)
 
@@ -260,7 +260,8 @@ class AdjustedCapture:
     """The adjusted spheres and poses.
 
     Attributes:
-        spheres_m: (N, 3) in the frame in which they were given; a sphere seen in fewer than two images is unchanged.
+        spheres_m: (N, 3) centres in the frame in which they were given; a sphere seen in fewer than two images is
+            unchanged.
         known: numbers of the spheres seen in at least two images.
         sigma_m: standard deviation of the least certain of these against the others.
         poses: T_scene_camera by viewpoint.
@@ -314,7 +315,7 @@ def adjust_together(
 
 
 def _worst_sigma_m(centres_m: Array, covariance: Array, scale_sigma: float) -> float:
-    """Worst standard deviation of the shape alone, without position and rotation of the whole.
+    """Return the worst standard deviation of the shape alone, without position and rotation of the whole.
 
     The spheres' radius is the only length in the images, so outlines that are all too wide make the whole too small.
     """

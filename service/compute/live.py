@@ -60,12 +60,12 @@ class ProvisionalRegistration:
     used: tuple[str, ...]  # images with spheres assigned, in the order of the registration
 
     def predicted_error_m(self, point_scan_m: Array) -> float:
-        """Predicted standard deviation (3D, metres) with which this station's images place a scan point (3,)."""
+        """Predict the standard deviation (3D, metres) with which this station's images place a scan point (3,)."""
         return self.registration.sigma_at_m(point_scan_m)
 
 
 def expected_spheres(T_camera_scan: Transform, spheres_m: Array, radius_m: float, camera: CameraModel) -> list[int]:
-    """Indices of the spheres (M, 3) whose whole outline lies in the image, ignoring occlusion."""
+    """Return the indices of the spheres (M, 3) whose whole outline lies in the image, ignoring occlusion."""
     centres = apply(T_camera_scan, spheres_m)
     distance = np.linalg.norm(centres, axis=1)
     front = (centres[:, 2] > 0.3 * distance) & (distance > 2 * radius_m)
@@ -89,9 +89,9 @@ def register_station(
 
     Args:
         views: any number of images with their outlines.
-        spheres_m: (M, 3) in the frame of the scan or the CT.
-        T_base_scan: from a registration of earlier images, by which spheres are identified; None: identified from
-            scratch.
+        spheres_m: (M, 3) centres in the frame of the scan or the CT.
+        T_base_scan: result of a registration of earlier images, by which spheres are identified; None: they are
+            identified from scratch.
 
     Raises:
         ComputeError: the outlines do not determine an answer yet.
@@ -120,7 +120,7 @@ def register_station(
 
 
 def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel) -> Sharpness:
-    """Width of the luma step across the outlines, and the outlines' own quality.
+    """Return the width of the luma step across the outlines, and the outlines' own quality.
 
     The width of an edge is its height over its steepest slope, in pixels; about 1.5 in a sharp image.
     """
@@ -144,14 +144,14 @@ def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], c
 
 
 def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
-    """Share of the pixels of an image (H, W, 3) with a clipped channel, estimated from every sixteenth pixel."""
+    """Return the share of pixels of an image (H, W, 3) with a clipped channel, from every sixteenth pixel."""
     return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
 
 
 def image_measures(
     image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel
 ) -> tuple[dict[str, float], bool]:
-    """Measures of an image (H, W, 3) as it arrives, by name, some NaN; and whether it is black."""
+    """Return the measures of an image (H, W, 3) as it arrives, by name, some NaN; and whether it is black."""
     quality = sharpness(image_bgr, outlines, camera)
     whole = image_quality(np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
     measures = {

@@ -82,7 +82,7 @@ class PipelineResult:
         return tuple(Assignment() for _ in self.images) if self.controls is None else self.controls.assignments
 
     def measures(self) -> dict[str, float]:
-        """The figures that gates judge, by their names in a run."""
+        """Return the figures that gates judge, by their names in a run."""
         out = {
             "predicted_error_mm": mm(self.registration.sigma_at_m(self.centre_scan_m)),
             "contradictions": float(sum(one.refuses for one in self.findings)),
@@ -94,7 +94,7 @@ class PipelineResult:
         return out
 
     def as_json(self, camera: CameraModel) -> dict[str, object]:
-        """The content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
+        """Return the content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
         r = self.registration
         return {
             "T_world_scan": r.T_world_scan.tolist(),
@@ -184,16 +184,17 @@ def register_images(
     """Identify, register and evaluate detected outlines.
 
     Args:
-        outlines: per image, from `locate_outlines` or `detect_all`.
+        outlines: the outlines of each image from `locate_outlines` or `detect_all`.
         images: camera, poses and names of the images. If the poses are not metric, their scale is estimated.
         spheres: registration spheres, and control spheres if there are any.
-        settings: as for `register`.
-        assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
+        settings: the settings of `register`.
+        assignments: registration sphere of outlines in each image, if `locate_outlines` knows it; None:
             identified here.
-        search: searches images for control spheres that the outlines lack; None: they count as not measured.
-        lens_covariance: (8, 8) of the calibration, which adds the component INTRINSICS to the covariance.
-        calibrated: (8, 8) of the calibration, with which the check compares; None: `lens_covariance`.
-        check: whether to look for contradictions: images that contradict the others are left out, and what the model
+        search: searches images for control spheres that are missing among the outlines; None: they count as not
+            measured.
+        lens_covariance: (8, 8) covariance of the calibration, which adds the component INTRINSICS to the covariance.
+        calibrated: (8, 8) covariance of the calibration with which the check compares; None: `lens_covariance`.
+        check: true to look for contradictions: images that contradict the others are left out, and what the model
             does not explain adds the component UNEXPLAINED.
 
     Raises:
@@ -267,14 +268,14 @@ def register_images(
 
 
 def _without(T_scan_camera: Array, left_out: Mapping[int, str]) -> Array:
-    """The poses, with NaN for images that were left out."""
+    """Return the poses, with NaN for images that were left out."""
     out = T_scan_camera.copy()
     out[list(left_out)] = np.nan
     return out
 
 
 def _with_component(registration: RegistrationResult, name: str, part: Array) -> RegistrationResult:
-    """The registration with a further (6, 6) part of its covariance; unchanged if the part is zero."""
+    """Return the registration with a further (6, 6) part of its covariance; unchanged if the part is zero."""
     if not part.any():
         return registration
     whole = np.zeros_like(registration.covariance)
@@ -308,7 +309,7 @@ def draw_overlay(
     control_centres_m: Array | None = None,
     radius_m: float = 0.015,
 ) -> NDArray[np.uint8]:
-    """A copy (H, W, 3) with detected outlines (green: registration, blue: control, grey: unused, red: excluded),
+    """Draw a copy (H, W, 3) with detected outlines (green: registration, blue: control, grey: unused, red: excluded),
     their sphere numbers, and the outlines that the registration predicts, dashed in yellow.
     """
     picture = image_bgr.copy()

@@ -1,4 +1,4 @@
-"""Governs what this process takes of its machine: memory, how freed memory is kept, and its priority."""
+"""Governs what this process takes of its machine: memory, how freed memory is held, and its priority."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class MachineMemory:
 
 
 def machine_memory(root: Path = Path("/")) -> MachineMemory:
-    """The memory that this process and others like it can have: the machine's, or less in a container or a group.
+    """Measure the memory that this process and others like it can have; it is less in a container or a group.
 
     Args:
-        root: above `proc` and `sys`.
+        root: folder above `proc` and `sys`.
     """
     machine = psutil.virtual_memory()
     total, available = machine.total, machine.available
@@ -45,13 +45,13 @@ def machine_memory(root: Path = Path("/")) -> MachineMemory:
 
 
 def processes_for(items: int, each_mb: float, memory: MachineMemory | None = None) -> int:
-    """The number of processes that share this work: one a core, as long as they fit into half of the memory."""
+    """Return the number of processes that share this work: one a core, as long as they fit into half the memory."""
     fit = int(0.5 * (memory or machine_memory()).total_mb / each_mb)
     return max(1, min(items, os.cpu_count() or 1, fit))
 
 
 def _groups(root: Path) -> Iterator[tuple[int, int]]:
-    """Limit and use, in bytes, of each group that confines this process (cgroups, version 1 and 2)."""
+    """Yield the limit and use, in bytes, of each group that confines this process (cgroups, version 1 and 2)."""
     try:
         lines = (root / "proc/self/cgroup").read_text(encoding="ascii").splitlines()
     except OSError:  # not Linux
@@ -107,10 +107,10 @@ def keep_freed_memory() -> None:
 
 @contextmanager
 def large_arrays_returned() -> Generator[None]:
-    """Within this block, return each freed array of a megabyte or more to the system at once.
+    """Return, within this block, each freed array of a megabyte or more to the system at once.
 
-    Surfaces and their samples have few, large arrays of ever other sizes: of what is kept for the next ones, most
-    would lie unused. Afterwards the process keeps what it frees, as a worker does.
+    Surfaces and their samples have few, large arrays of ever other sizes: of what is held back for the next ones,
+    most would lie unused. Afterwards the process keeps what it frees, as a worker does.
     """
     return_freed_memory()
     with suppress(OSError, AttributeError):
@@ -124,7 +124,7 @@ def large_arrays_returned() -> Generator[None]:
 
 
 def return_freed_memory() -> None:
-    """Return to the system what was freed and kept, before a step whose arrays have other sizes."""
+    """Return freed memory to the system, before a step whose arrays have other sizes."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 

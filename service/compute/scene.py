@@ -21,8 +21,8 @@ class PosedImages:
         poses: (N, 4, 4) T_world_camera, or T_base_camera in the base frame of each image's station.
         camera: intrinsics of all images.
         groups: (N,) station of each image; images of one station share a base frame. None: all the same.
-        metric: whether the positions are in metres; if not, their scale is estimated.
-        names: of the images, for messages and results; empty: "image 0", "image 1" and so on.
+        metric: true if the positions are in metres; if not, their scale is estimated.
+        names: names of the images, for messages and results; empty: "image 0", "image 1" and so on.
     """
 
     poses: Array = field(repr=False)
@@ -63,7 +63,7 @@ class ScanSpheres:
         centres_m: (M, 3) registration spheres.
         radius_m: radius of all spheres.
         control_m: (C, 3) control spheres, which only the evaluation uses.
-        covariance_m2: (M, 3, 3) of the registration spheres' centres; None takes them as exact.
+        covariance_m2: (M, 3, 3) covariance of the registration spheres' centres; None takes them as exact.
     """
 
     centres_m: Array = field(repr=False)

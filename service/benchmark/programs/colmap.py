@@ -21,7 +21,7 @@ from service.core.geometry import transform
 
 
 def views_of(data: Path) -> tuple[StereoView, ...]:
-    """The images of an export in the format `colmap-pinhole`.
+    """Return the images of an export in the format `colmap-pinhole`.
 
     Raises:
         DataError: a camera is not a pinhole, or an image cannot be read.

@@ -38,7 +38,7 @@ _USAGE = "usage: python -m service.benchmark.programs.gaussians DATA MESH [STEPS
 
 
 def first_gaussians(torch: Any, points_m: Array) -> Any:
-    """Grey Gaussians at points (N, 3), as large as the distance between neighbours, nearly transparent."""
+    """Return grey Gaussians at points (N, 3), as large as the distance between neighbours, nearly transparent."""
     count = len(points_m)
     size = float(np.cbrt(np.prod(np.ptp(points_m, axis=0)) / count))
     quats = np.random.default_rng(0).normal(size=(count, 4))
@@ -95,7 +95,7 @@ class Splatting:
                 sys.stdout.flush()
 
     def depth_map(self, view: StereoView) -> DepthMap:
-        """Expected depth of a view, where it is opaque."""
+        """Return the expected depth of a view, where it is opaque."""
         with self._torch.no_grad():
             rendered, opacity, _ = self._rendered(view, "ED")
         depth = rendered[0, ..., 0].cpu().numpy().astype(np.float32)

@@ -24,9 +24,9 @@ _MAX_HALF = 30  # px; a larger window gains nothing, and lens distortion bends t
 _SMOOTHING = 0.15  # sigma of the smoothing, in half windows
 _MAX_SMOOTHING_PX = 1.5
 _MIN_CHARUCO_CORNERS = 8
-#: Largest relative error of a board's size if nothing is stated: 0.1 mm in 200 mm, as of boards made for measuring.
+#: Largest relative error of a board's size if none is given: 0.1 mm in 200 mm, as of boards made for measuring.
 SIZE_TOLERANCE = 5e-4
-#: Largest bow of a board if nothing is stated: composite plates and glued prints have 0.05 to 0.2 mm.
+#: Largest bow of a board if none is given: composite plates and glued prints have 0.05 to 0.2 mm.
 FLATNESS_M = 2e-4
 
 
@@ -45,10 +45,10 @@ class Board:
         dictionary: OpenCV's name for the dictionary of a ChArUco board's markers.
         legacy: a ChArUco board as OpenCV printed it before 4.6 (differs if the number of squares in a column is
             even).
-        size_tolerance: largest relative error of `square_m`, as the maker states it.
-        flatness_m: largest bow of the board, as the maker states it; 0: exactly flat.
-        bow_m: by how much the board's middle lies behind its sides, and behind its ends: the rise of an arc along the
-            columns and of one along the rows; negative if the middle comes towards the camera.
+        size_tolerance: largest relative error of `square_m`, as given by the maker.
+        flatness_m: largest bow of the board, as given by the maker; 0: exactly flat.
+        bow_m: how far the board's middle lies behind its sides, and behind its ends, in metres: the rise of an arc
+            along the columns and of one along the rows; negative if the middle comes towards the camera.
     """
 
     columns: int
@@ -72,7 +72,7 @@ class Board:
             raise DataError("a ChArUco marker is smaller than its square", remedy="Give the marker's side")
 
     def points(self) -> Array:
-        """(columns · rows, 3) in the board frame, metres, row by row: x along the columns, y along the rows.
+        """Return (columns · rows, 3) in the board frame, metres, row by row: x along the columns, y along the rows.
 
         They lie in the plane z = 0 if the board is not bent.
         """
@@ -82,7 +82,7 @@ class Board:
         return flat
 
     def bends(self) -> Array:
-        """(columns · rows, 2) displacement along z of each point by a bow of 1 along x, and along y."""
+        """Return (columns · rows, 2) displacement along z of each point by a bow of 1 along x, and along y."""
         flat = self._flat()[:, :2]
         half = np.ptp(flat, axis=0) / 2
         return 1 - ((flat - flat.min(axis=0)) / half - 1) ** 2
@@ -95,7 +95,7 @@ class Board:
         return np.stack([x, row.ravel() * self.square_m, np.zeros(x.size)], axis=1)
 
     def half_turn(self) -> Transform | None:
-        """T_board_turned if the board looks the same after half a turn; None if its ends can be told apart."""
+        """Return T_board_turned if the board looks the same after half a turn; None if its ends are distinct."""
         if self.pattern == "charuco" or (self.pattern == "circles" and self.rows % 2):
             return None
         if self.pattern == "circles":
@@ -106,7 +106,7 @@ class Board:
         return 0.75 * self.square_m if self.marker_m is None else self.marker_m
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """The board as an OpenCV object.
+        """Return the board as an OpenCV object.
 
         Raises:
             DataError: the dictionary is unknown or has too few markers.
@@ -128,7 +128,7 @@ class Board:
         return board
 
     def reach(self) -> float:
-        """Radius around a corner, in squares, within which only this corner's own edges are printed."""
+        """Return the radius around a corner, in squares, within which only this corner's own edges are printed."""
         if self.pattern == "charuco":
             return min(_REACH, 0.9 * (1 - self._marker_m() / self.square_m) / 2)
         return _REACH
@@ -148,13 +148,13 @@ class BoardView:
 
 
 def board_points(columns: int, rows: int, square_m: float) -> Array:
-    """(columns · rows, 3) inner corners in the board frame, row by row, in the unit of `square_m`."""
+    """Return (columns · rows, 3) inner corners in the board frame, row by row, in the unit of `square_m`."""
     y, x = np.mgrid[:rows, :columns]
     return np.stack([x.ravel() * square_m, y.ravel() * square_m, np.zeros(x.size)], axis=1)
 
 
 def half_turn(columns: int, rows: int, square_m: float) -> Transform | None:
-    """T_board_turned of a checkerboard that looks the same after half a turn; None if colours tell its ends apart.
+    """Return T_board_turned of a checkerboard that half a turn leaves alike; None if colours distinguish its ends.
 
     With one even and one odd number of inner corners, opposite corners have opposite colours.
     """
@@ -181,7 +181,7 @@ def find_board(image_grey: Grey, board: Board) -> BoardView:
 
 
 def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDArray[np.bool_]]:
-    """All corners of a checkerboard, and which of them can be trusted.
+    """Find all corners of a checkerboard, and which of them can be trusted.
 
     A board with one even and one odd corner count is always numbered from the same physical corner, the one that
     makes the square between the first corners of the first two rows dark.
@@ -201,7 +201,7 @@ def _check(image: Grey) -> None:
 
 
 def _reduced(image: Grey, target: int) -> tuple[Grey, Array]:
-    """A copy whose longer side is at most `target` px, and the factors (2,) from its pixels to the image's."""
+    """Return a copy whose longer side is at most `target` px, and the factors (2,) from its pixels to the image's."""
     height, width = image.shape
     factor = min(1.0, target / max(width, height))
     if factor == 1.0:
@@ -235,7 +235,7 @@ def _search_checkerboard(image: Grey, columns: int, rows: int) -> Array:
 
 
 def _grid_spacing(grid: Array) -> float:
-    """Shortest distance between neighbours of a (rows, columns, 2) grid, px."""
+    """Return the shortest distance between neighbours of a (rows, columns, 2) grid, px."""
     return min(
         float(np.linalg.norm(np.diff(grid, axis=0), axis=2).min()),
         float(np.linalg.norm(np.diff(grid, axis=1), axis=2).min()),
@@ -243,7 +243,7 @@ def _grid_spacing(grid: Array) -> float:
 
 
 def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Refined corners (N, 2), and which of them stayed near their start with their whole window in the image.
+    """Refine corners (N, 2); return also which stayed near their start with their whole window in the image.
 
     A corner is the point whose directions to all pixels of the window are normal to the gradients there. Four squares
     meet with point symmetry, so neither gamma nor blur moves this point. Smoothing first halves the error:
@@ -268,12 +268,12 @@ def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray
 
 
 def half_window(spacing_px: float, reach: float) -> int:
-    """Half the side of the window in which a corner is refined, px; `reach` is `Board.reach`."""
+    """Return half the side of the window in which a corner is refined, px; `reach` is `Board.reach`."""
     return int(np.clip(reach * spacing_px, 2, _MAX_HALF))
 
 
 def _first_square_is_dark(image: Grey, grid: Array) -> bool:
-    """Whether the first square is dark, by the mean brightness at the centres of the squares of each colour."""
+    """Return whether the first square is dark, by the mean brightness at the centres of both colours' squares."""
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     x = np.clip(centres[..., 0].round().astype(int), 0, image.shape[1] - 1)
     y = np.clip(centres[..., 1].round().astype(int), 0, image.shape[0] - 1)
@@ -315,7 +315,7 @@ def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners
 
 
 def _scatter(corners: Array) -> float:
-    """A length that scales with the spacing of the corners, px."""
+    """Return a length that scales with the spacing of the corners, px."""
     return float(np.sqrt(np.prod(np.ptp(corners, axis=0)) / len(corners)))
 
 
@@ -348,7 +348,7 @@ def _find_circles(image: Grey, board: Board) -> BoardView:
 
 
 def _centroids(image: Grey, start: Array) -> Array:
-    """Centroids (N, 2) of the dark circles, each pixel weighted by how much of it is dark."""
+    """Return the centroids (N, 2) of the dark circles, each pixel weighted by how much of it is dark."""
     distance = np.linalg.norm(start[:, None] - start[None], axis=2) + np.diag(np.full(len(start), np.inf))
     half = int(0.5 * distance.min())
     out = start.copy()

@@ -41,7 +41,7 @@ class Candidates:
     pixels: Array
 
     def take(self, which: NDArray[np.int64]) -> Candidates:
-        """Only the candidates with these indices."""
+        """Return only the candidates with these indices."""
         return Candidates(self.T_base_camera[which], self.pixels[which])
 
 
@@ -55,7 +55,7 @@ def board_candidates(
     seed: int = 0,
     draw: int = 0,
 ) -> Candidates:
-    """Poses that keep the whole printed board in the frame for every truth within the tolerances.
+    """Return poses that keep the whole printed board in the frame for every truth within the tolerances.
 
     Args:
         known: nominal values or estimates, with their tolerances.
@@ -63,7 +63,7 @@ def board_candidates(
         wishes: tilts, rolls and distances.
         approach: (3,) horizontal unit vector from the scene towards the base; images are upright for a viewer there.
         most: number of poses tried, drawn at random from all combinations.
-        seed: of the draw.
+        seed: seed of the draw.
         draw: 1 for the next so many combinations, which the draw before did not have, and so on.
 
     Returns:
@@ -83,14 +83,14 @@ def board_candidates(
 
 
 def expected_pixels(known: BoardKnowledge, board: Board, T_base_camera: Array) -> Array:
-    """(C, P, 2) pixels of the board's points for the estimated camera, mount and board."""
+    """Return (C, P, 2) pixels of the board's points for the estimated camera, mount and board."""
     boards = np.array([inverse(T) @ known.T_base_board for T in T_base_camera]).reshape(-1, 4, 4)
     points = np.einsum("nij,pj->npi", boards[:, :3, :3], board.points()) + boards[:, None, :3, 3]
     return known.camera.project(points.reshape(-1, 3)).reshape(len(boards), len(board.points()), 2)
 
 
 def _outline(board: Board) -> Array:
-    """(8, 3) edge of the printed squares in the board frame; it lies one square beyond the inner corners."""
+    """Return (8, 3) edge of the printed squares in the board frame; it lies one square beyond the inner corners."""
     points = board.points()[:, :2]
     low, high = points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
     share = [(0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5)]
@@ -108,7 +108,7 @@ class _ToleranceDraws:
         self.outline_base = np.array([apply(board, outline) for board in boards])  # (D, K, 3)
 
     def pixels(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """(C, D, K, 2) pixels of the outline and (C, D, K) its depths, m."""
+        """Return (C, D, K, 2) pixels of the outline and (C, D, K) its depths, m."""
         R = T_base_camera[:, :3, :3]
         moved = self.outline_base[None] - T_base_camera[:, None, None, :3, 3]
         sent = np.einsum("cji,cdkj->cdki", R, moved)
@@ -138,7 +138,7 @@ def _grid(known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Arra
 
 
 def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _ToleranceDraws) -> Array:
-    """Each pose shifted in its image plane until the board touches the wanted side of the frame, or is centred."""
+    """Shift each pose in its image plane until the board touches the wanted side of the frame, or is centred."""
     size, margin = np.array([camera.width, camera.height]), _MARGIN * camera.width
     poses = poses.copy()
     for _ in range(_ROUNDS):
@@ -175,7 +175,7 @@ _TRIED = 40  # of the best ones, until the arm can take one
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTargets:
-    """Which calibrations the images are for, and their targets."""
+    """The calibrations that the images are for, and their targets."""
 
     intrinsics: bool = True
     hand_eye: bool = True
@@ -191,11 +191,11 @@ class PlanPrediction:
         images: number of images.
         coverage: share of the image's cells with a corner.
         coverage_map: (8, 12) corners in each cell.
-        uncertainty_mm: of a projected point at the board's distance, worst in the image; NaN if the images do not
-            determine the camera.
+        uncertainty_mm: uncertainty of a projected point at the board's distance, in mm, worst in the image; NaN if
+            the images do not determine the camera.
         tilt_deg: largest tilt of the board.
         rotation_spread_deg: largest rotation between two images.
-        hand_eye_sigma_mm, hand_eye_sigma_deg: of T_flange_camera.
+        hand_eye_sigma_mm, hand_eye_sigma_deg: standard deviation of T_flange_camera.
     """
 
     images: int
@@ -216,7 +216,7 @@ class ChosenViews:
     pixels: tuple[Array, ...] = ()
 
     def plus(self, poses: Array, pixels: Sequence[Array]) -> ChosenViews:
-        """These with further ones."""
+        """Return these with further ones."""
         return ChosenViews(np.concatenate([self.T_base_camera, poses.reshape(-1, 4, 4)]), (*self.pixels, *pixels))
 
 
@@ -225,7 +225,7 @@ NOTHING = ChosenViews(np.zeros((0, 4, 4)))
 
 @dataclass(frozen=True, slots=True)
 class DesignProblem:
-    """What images of the board are to determine.
+    """The unknowns that images of the board must determine, and how well.
 
     Attributes:
         known: estimates of camera, mount and board.
@@ -238,12 +238,12 @@ class DesignProblem:
     aims: CalibrationTargets
 
     def as_taken(self, T_base_camera: Array) -> ChosenViews:
-        """Poses (K, 4, 4) as if their images were taken, with the board's points at their expected pixels."""
+        """Return poses (K, 4, 4) as if their images were taken, with the board's points at their expected pixels."""
         poses = T_base_camera.reshape(-1, 4, 4)
         return ChosenViews(poses, tuple(expected_pixels(self.known, self.board, poses)))
 
     def predict(self, taken: ChosenViews) -> PlanPrediction:
-        """What calibrations from these images will achieve."""
+        """Predict the accuracy of calibrations from these images."""
         known, board, sigma_px = self.known, self.board, self.aims.corner_sigma_px
         counts = _counts(taken.pixels, known)
         boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
@@ -277,16 +277,16 @@ def choose_poses(
     enough: Callable[[PlanPrediction], bool] | None = None,
     seed: int = 0,
 ) -> Array:
-    """Up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
+    """Choose up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
 
     Args:
-        problem: what the images are to determine.
-        candidates: to choose from.
+        problem: the unknowns that the images must determine.
+        candidates: the poses to choose from.
         count: largest number of poses.
         taken: images that count already.
-        feasible: whether the arm can go there; asked only for the best candidates.
-        enough: asked after each pose; once it returns True, no more are chosen.
-        seed: of the random samples of later picks.
+        feasible: says if the arm can go there; called only for the best candidates.
+        enough: called after each pose; once it returns True, no more are chosen.
+        seed: seed of the random samples of later picks.
     """
     rng = np.random.default_rng([seed, 0x9A5E])
     worth = _InformationGain(problem)
@@ -318,7 +318,7 @@ def choose_poses(
 
 
 def _first(ranked: NDArray[np.int64], open_: NDArray[np.bool_], feasible: Callable[[int], bool]) -> int | None:
-    """The first feasible candidate, or None; it and those before it are no longer open."""
+    """Return the first feasible candidate, or None; it and those before it are no longer open."""
     for k in ranked.tolist():
         open_[k] = False
         if feasible(k):
@@ -335,7 +335,7 @@ class _InformationGain:
         self.field = lens_field(problem.known.camera)
 
     def gains(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """(C, 8, 8) of the camera and (C, 12, 12) of mount and board."""
+        """Return (C, 8, 8) of the camera and (C, 12, 12) of mount and board."""
         count = len(T_base_camera)
         lens = np.zeros((count, *self.prior.shape))
         mount = np.zeros((count, 12, 12))
@@ -349,17 +349,17 @@ class _InformationGain:
         return lens, mount
 
     def start(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """Information (8, 8) and (12, 12) from images that count already, plus the prior from the nominal values."""
+        """Sum the information (8, 8) and (12, 12) of images that count already and the prior of nominal values."""
         lens, mount = self.gains(T_base_camera)
         weak = np.diag(1 / np.array([*[0.01] * 3, *[0.05] * 3, *[0.05] * 3, *[0.2] * 3]) ** 2)
         return self.prior + lens.sum(axis=0), weak + mount.sum(axis=0)
 
     def plus(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], k: int) -> tuple[Array, Array]:
-        """With candidate `k` added."""
+        """Add the information of candidate `k`."""
         return so_far[0] + gains[0][k], so_far[1] + gains[1][k]
 
     def cost(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], pool: NDArray[np.int64]) -> Array:
-        """(K,) logarithm of the variance left after adding each candidate of the pool."""
+        """Return (K,) logarithm of the variance left after adding each candidate of the pool."""
         cost = np.zeros(len(pool))
         if self.aims.intrinsics:
             covariance = inverse_of(so_far[0] + gains[0][pool])
@@ -373,7 +373,7 @@ class _InformationGain:
 
 
 def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.bool_]:
-    """(C, 96) whether each cell holds a corner of (C, P, 2) within the inner share of its sides."""
+    """Return (C, 96) whether each cell holds a corner of (C, P, 2) within the inner share of its sides."""
     if not len(pixels):
         return np.zeros((0, COVERAGE_GRID[0] * COVERAGE_GRID[1]), dtype=bool)
     place = (pixels + 0.5) / [known.camera.width, known.camera.height] * COVERAGE_GRID
@@ -385,19 +385,19 @@ def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.boo
 
 
 def _covered(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.bool_]:
-    """(96,) whether each cell holds a corner of images that count already."""
+    """Return (96,) whether each cell holds a corner of images that count already."""
     return _counts(pixels, known).ravel() > 0
 
 
 def _counts(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.int64]:
-    """(8, 12) corners in each cell."""
+    """Return (8, 12) corners in each cell."""
     if not pixels:
         return np.zeros(COVERAGE_GRID[::-1], dtype=np.int64)
     return coverage_map_of(pixels, (known.camera.width, known.camera.height))
 
 
 def _spread_deg(boards: Array) -> float:
-    """Largest rotation between two views, degrees."""
+    """Return the largest rotation between two views, degrees."""
     if len(boards) < 2:
         return 0.0
     turns = Rotation.from_matrix(boards[:, :3, :3])

@@ -22,7 +22,7 @@ _BORDER = 1.6  # corner spacings between the last visible corner and the frame: 
 _FEWEST_CORNERS = 8
 _FEWEST_CIRCLES = 12
 _ROUND = 0.85  # circularity of a dark spot that is no square: a square has 0.79, a circle at 45° 0.9
-_MARKER_OFF = 0.05  # relative error of a marker's side that is told
+_MARKER_OFF = 0.05  # relative error of a marker's side that is reported
 _DICTIONARIES = tuple(
     sorted(
         (name for name in dir(cv2.aruco) if name.startswith("DICT_") and "APRILTAG" not in name),
@@ -33,12 +33,12 @@ _DICTIONARIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What an image shows instead of the described board.
+    """A reason why an image does not show the described board.
 
     Attributes:
-        words: for people, without a full stop.
-        remedy: what to do.
-        of_board: whether the description is wrong, and so fails for every image; otherwise only this image is at
+        words: the text for people, without a full stop.
+        remedy: the advice to the user.
+        of_board: true if the description is wrong, and so fails for every image; otherwise only this image is at
             fault.
     """
 
@@ -48,7 +48,7 @@ class Diagnosis:
 
 
 def diagnose(image: Grey, board: Board) -> Diagnosis | None:
-    """Why `find_board` may have found nothing; None if none of the usual mistakes explains it.
+    """Return why `find_board` may have found nothing; None if none of the usual mistakes explains it.
 
     Takes a fraction of a second for a checkerboard and some seconds for a ChArUco board.
     """
@@ -58,7 +58,7 @@ def diagnose(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
-    """The mistake in the board's description that explains two of these images; None if any image shows the board.
+    """Find the mistake in the board's description that explains two images; None if any image shows the board.
 
     A single image may just show a partly covered board, so one is enough only if there is no other.
     """
@@ -96,7 +96,7 @@ def _small(image: Grey, width: int) -> Grey:
 
 
 def _seen(image: Grey) -> tuple[tuple[int, int], Array] | None:
-    """Columns and rows of the largest corner grid in the image, and the corners (rows, columns, 2)."""
+    """Return the columns and rows of the largest corner grid in the image, and the corners (rows, columns, 2)."""
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST, _LEAST), flags)
     if not found:
@@ -141,7 +141,7 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def _at_frame(corners: Array, shape: tuple[int, ...]) -> bool:
-    """Whether the next row or column of corners would lie outside the image."""
+    """Return whether the next row or column of corners would lie outside the image."""
     spacing = max(
         float(np.median(np.linalg.norm(np.diff(corners, axis=0), axis=2))),
         float(np.median(np.linalg.norm(np.diff(corners, axis=1), axis=2))),
@@ -177,7 +177,7 @@ def _charuco(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def _variants(board: Board) -> list[tuple[Board, str, str]]:
-    """Boards that are often confused, each with the mistake in words and the option that corrects it."""
+    """Return boards that are often confused, each with the text of the mistake and the option that corrects it."""
     c, r = board.columns, board.rows
     counts = (
         ((c, r), ""),
@@ -205,7 +205,7 @@ def _variants(board: Board) -> list[tuple[Board, str, str]]:
 
 
 def _wrong_markers(images: Sequence[Grey], board: Board) -> Diagnosis | None:
-    """The true side of a ChArUco board's markers if another one is described."""
+    """Return the true side of a ChArUco board's markers if another one is described."""
     ratios = [ratio for image in images for ratio in _marker_ratios(_small(image, _CHARUCO_WIDTH), board)]
     if not ratios or abs(float(np.median(ratios)) - 1) < _MARKER_OFF:
         return None
@@ -219,7 +219,7 @@ def _wrong_markers(images: Sequence[Grey], board: Board) -> Diagnosis | None:
 
 
 def _marker_ratios(image: Grey, board: Board) -> Array:
-    """True over described side of every marker in an image whose place on the board is known."""
+    """Return the ratio of true to described side of each marker in an image whose place on the board is known."""
     described = board.charuco()
     corners, identifiers, _ = _marker_detector(board.dictionary).detectMarkers(image)
     if identifiers is None or len(identifiers) < _FEWEST_MARKERS:  # pyright: ignore[reportUnnecessaryComparison]
@@ -251,7 +251,7 @@ _LEGACY_WORDS = {
 
 
 def _corners(image: Grey, board: Board) -> int:
-    """Number of corners that lie on one plane in this board's arrangement."""
+    """Return the number of corners that lie on one plane in this board's arrangement."""
     try:
         found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(image)
     except cv2.error:
@@ -273,7 +273,7 @@ def _markers(image: Grey, dictionary: str) -> int:
 
 
 def _best_dictionary(image: Grey) -> tuple[str, int]:
-    """The dictionary with the most markers in the image (the smallest one in a tie), and their number."""
+    """Return the dictionary with the most markers in the image (the smallest one in a tie), and their number."""
     # Quadrilaterals are searched for once, and compared with all dictionaries.
     _, identifiers, _, dictionary = _detector_of_all().detectMarkersMultiDict(image)
     best = ("", 0)
@@ -287,7 +287,7 @@ def _best_dictionary(image: Grey) -> tuple[str, int]:
 
 @cache
 def _detector_of_all() -> cv2.aruco.ArucoDetector:
-    """A detector that knows all dictionaries, in their order."""
+    """Return a detector that knows all dictionaries, in their order."""
     known = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in _DICTIONARIES]
     return cv2.aruco.ArucoDetector(known, cv2.aruco.DetectorParameters(), cv2.aruco.RefineParameters())
 
@@ -296,7 +296,7 @@ def _detector_of_all() -> cv2.aruco.ArucoDetector:
 
 
 def _circles_in(image: Grey) -> int:
-    """Number of dark round spots."""
+    """Return the number of dark round spots."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.minArea, settings.maxArea = 20, image.size / 100
     settings.filterByCircularity, settings.minCircularity = True, _ROUND

@@ -1,4 +1,4 @@
-"""Holds what is known of the board's place and the camera's mount, and predicts what further images would tell."""
+"""Holds what is known of the board's place and the camera's mount, and predicts what further images would show."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Tolerances:
     """Tolerances as bounds, for each axis.
 
     Attributes:
-        mount_m, mount_rad: of the camera on the flange, from its drawing.
-        place_m: of the board's middle, horizontally, including how well the scene's centre was measured.
-        height_m: of the board's middle, vertically.
-        turn_rad: of the board about the vertical.
-        tilt_rad: of the board from the horizontal.
-        focal: of the focal length, relative.
-        centre: of the principal point, over the image's width.
+        mount_m, mount_rad: error of the camera on the flange against its drawing.
+        place_m: horizontal position of the board's middle, including how well the scene's centre was measured.
+        height_m: vertical position of the board's middle.
+        turn_rad: rotation of the board about the vertical.
+        tilt_rad: tilt of the board from the horizontal.
+        focal: focal length, relative.
+        centre: principal point, over the image's width.
     """
 
     mount_m: float = 0.002
@@ -58,8 +58,8 @@ class BoardKnowledge:
     """The estimates from which board poses are planned, with their tolerances.
 
     Attributes:
-        camera: nominal, or calibrated.
-        T_flange_camera, T_base_board: nominal, or estimated from the images.
+        camera: the nominal camera, or the calibrated one.
+        T_flange_camera, T_base_board: the nominal poses, or those estimated from the images.
         spread: (12, 12); the possible increments (d, w) of T_flange_camera and T_base_board are spread @ u for every
             u within ± 1.
         focal: relative tolerance of the focal length.
@@ -100,15 +100,15 @@ def nominal_knowledge(
     long_side_across: bool = True,
     tolerances: Tolerances = Tolerances(),
 ) -> BoardKnowledge:
-    """The knowledge before any image.
+    """Return the knowledge before any image.
 
     Args:
-        camera: nominal, for the images' size.
-        T_flange_camera: from the mount's drawing.
+        camera: the nominal camera, for the images' size.
+        T_flange_camera: the camera's pose on the flange by the mount's drawing.
         middle_m: (3,) intended place of the board's middle, base frame.
         approach: (3,) horizontal unit vector from the scene towards the base.
         board: lies face up and level.
-        long_side_across: whether the board's long side runs across the approach; otherwise along it.
+        long_side_across: true if the board's long side runs across the approach; otherwise it runs along it.
         tolerances: bounds.
     """
     middle = board.points().mean(axis=0)
@@ -136,14 +136,14 @@ def refined_knowledge(
     prior; the arm's error is taken as about a millimetre.
 
     Args:
-            known: nominal, or from calibrations so far.
-            views: (N) of the board, N > 0.
-            T_base_flange: (N, 4, 4).
-            board: the board in the views.
-            lens_known: whether the camera is calibrated and stays as it is.
+        known: the nominal knowledge, or that of calibrations so far.
+        views: (N) views of the board, N > 0.
+        T_base_flange: (N, 4, 4) poses of the flange.
+        board: the board in the views.
+        lens_known: true if the camera is calibrated and stays as it is.
 
-        Returns:
-            The knowledge, and T_camera_board (N, 4, 4) of the views.
+    Returns:
+        The knowledge, and T_camera_board (N, 4, 4) of the views.
 
     Raises:
         DataError: there is no view.
@@ -172,13 +172,13 @@ def refined_knowledge(
 def _posterior(
     known: BoardKnowledge, prior_board: Transform, hands: Array, boards: Array, C: Array
 ) -> tuple[Transform, Transform, Array]:
-    """Posterior T_flange_camera and T_base_board, and their covariance (12, 12)."""
+    """Return the posterior T_flange_camera and T_base_board, and their covariance (12, 12)."""
     precision = np.linalg.inv(known.spread @ known.spread.T / 3 + 1e-16 * np.eye(12))
     mount0 = known.T_flange_camera
     noise = np.diag([_ARM_M**2] * 3 + [_ARM_RAD**2] * 3)
 
     def minimum_at(mount: Transform, board: Transform) -> tuple[Array, Array]:
-        """Step (12,) and covariance (12, 12)."""
+        """Return the step (12,) and covariance (12, 12)."""
         e, J, JM = linearise(hands, boards, mount, board)
         V = np.linalg.inv(noise + JM @ C @ np.swapaxes(JM, 1, 2))
         H = np.einsum("nia,nij,njb->ab", J, V, J) + precision
@@ -200,13 +200,13 @@ def _posterior(
 
 
 def _from(start: Transform, end: Transform) -> Array:
-    """(6,) increment (d, w) that takes `start` to `end`."""
+    """Return (6,) increment (d, w) that takes `start` to `end`."""
     w = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
     return np.concatenate([end[:3, 3] - start[:3, 3], w])
 
 
 def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tuple[CameraModel, float, float]:
-    """A lens from the first images if it is plausible: near the nominal one, and with moderate distortion."""
+    """Return a lens from the first images if it is plausible: near the nominal one, and with moderate distortion."""
     size = (known.camera.width, known.camera.height)
     try:
         found = calibrate_intrinsics(views, board, size, model="radial2").camera
@@ -220,7 +220,7 @@ def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tu
 
 
 def _nearer_end(T_base_board: Transform, seen: Transform, board: Board) -> Transform:
-    """The nominal pose, or that of the board rotated by half a turn, whichever is nearer to the observed one."""
+    """Return the nominal pose, or that of the board turned by half a turn, whichever is nearer the observed one."""
     middle = board.points().mean(axis=0)
     other = T_base_board @ transform(Rotation.from_euler("z", np.pi), 2 * middle * [1, 1, 0])
     return min((T_base_board, other), key=lambda T: float(np.linalg.norm(T[:3, :3] - seen[:3, :3])))
@@ -245,13 +245,13 @@ _EVERY = 2  # use every second corner of rows and columns; more would only avera
 
 
 def lens_prior(camera: CameraModel) -> Array:
-    """(8, 8) prior information from the nominal values."""
+    """Return (8, 8) prior information from the nominal values."""
     scale = np.array([camera.fx, camera.fy, camera.width, camera.width, 1, 1, 1, 1])
     return np.diag(1 / (np.array(_PRIOR_SIGMA) * scale) ** 2)
 
 
 def lens_information(boards: Array, camera: CameraModel, board: Board, corner_sigma_px: float) -> Array:
-    """(C, 8, 8) information about fx … p2 from images of boards T_camera_board (C, 4, 4) whose poses are unknown."""
+    """Return (C, 8, 8) information about fx … p2 from boards T_camera_board (C, 4, 4) of unknown pose."""
     some = (
         np.arange(board.columns * board.rows, dtype=np.int64)
         .reshape(board.rows, board.columns)[::_EVERY, ::_EVERY]
@@ -262,7 +262,7 @@ def lens_information(boards: Array, camera: CameraModel, board: Board, corner_si
 
 
 def lens_field(camera: CameraModel) -> Array:
-    """(8, 8) matrix F such that trace(F C) is the mean variance, px², of projected points, less a camera motion.
+    """Return (8, 8) F such that trace(F C) is the mean variance, px², of projected points, less a camera motion.
 
     C is the covariance of fx … p2. Whatever a rigid motion of the camera can absorb is not a calibration error.
     """
@@ -277,7 +277,7 @@ def lens_field(camera: CameraModel) -> Array:
 
 
 def hand_eye_information(T_base_camera: Array, known: BoardKnowledge, board: Board, corner_sigma_px: float) -> Array:
-    """(C, 12, 12) information of each pose about T_flange_camera and T_base_board."""
+    """Return (C, 12, 12) information of each pose about T_flange_camera and T_base_board."""
     points = board.points()
     corners = points.reshape(board.rows, board.columns, 3)[:: board.rows - 1, :: board.columns - 1].reshape(-1, 3)
     share = len(points) / len(corners)
@@ -294,7 +294,7 @@ def hand_eye_information(T_base_camera: Array, known: BoardKnowledge, board: Boa
 
 
 def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigma_px: float) -> float:
-    """Predicted `projection_uncertainty` of a calibration from boards T_camera_board (N, 4, 4), worst in the image.
+    """Predict the `projection_uncertainty`, worst in the image, of a calibration from T_camera_board (N, 4, 4).
 
     At the boards' median distance; NaN if they do not determine the camera.
     """
@@ -314,7 +314,7 @@ def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigm
 
 
 def inverse_of(information: Array) -> Array:
-    """(N, K, K) inverses of positive definite matrices, scaled first because their units differ widely."""
+    """Return (N, K, K) inverses of positive definite matrices, scaled first because their units differ widely."""
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return np.linalg.inv(information * both) * both

@@ -36,7 +36,7 @@ class SuggestedPose:
         T_base_flange: target pose of the flange.
         T_base_camera: the camera's pose there.
         sigma_mm: predicted standard deviation of T_flange_camera's translation after this and all poses before it.
-        sigma_deg: the same for its rotation.
+        sigma_deg: standard deviation of its rotation.
     """
 
     T_base_flange: Transform
@@ -55,19 +55,19 @@ def suggest_board_poses(
     count: int = 6,
     reachable: Callable[[Transform], bool] | None = None,
 ) -> tuple[SuggestedPose, ...]:
-    """Greedy A-optimal choice among arcs and rolls around the board, on the linearised weighted problem.
+    """Choose poses by greedy A-optimality among arcs and rolls around the board, on the linearised weighted problem.
 
     The criterion is the mean square displacement that T_flange_camera's error causes at the board's distance.
     Candidates show the whole board.
 
     Args:
         answer: the calibration so far; its robot noise weights the poses.
-        T_base_flange: (N, 4, 4) taken so far.
-        points_m: (P, 3) of the board.
-        camera: calibrated.
+        T_base_flange: (N, 4, 4) poses taken so far.
+        points_m: (P, 3) the board's points.
+        camera: the calibrated camera.
         corner_sigma_px: standard deviation of a corner.
         count: number of poses wanted.
-        reachable: whether the arm can take a flange pose; asked only for the best candidates.
+        reachable: says if the arm can take a flange pose; called only for the best candidates.
 
     Returns:
         Up to `count` poses in the order of their gain; fewer if no others are reachable.
@@ -108,7 +108,7 @@ def suggest_board_poses(
 
 
 def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, camera: CameraModel) -> Array:
-    """(C, 4, 4) camera poses around the board with the whole board in the image."""
+    """Return (C, 4, 4) camera poses around the board with the whole board in the image."""
     centre_board = points_m.mean(axis=0)
     eyes = (T_base_camera @ np.array([0.0, 0.0, 0.0, 1.0]))[:, :3]
     centre = T_base_board[:3, :3] @ centre_board + T_base_board[:3, 3]
@@ -137,11 +137,11 @@ class _Model:
     """The linearised measurement of a board pose.
 
     Attributes:
-        T_flange_camera, T_base_board: by the calibration so far.
-        points_m: (P, 3) of the board.
-        camera: calibrated.
+        T_flange_camera, T_base_board: the poses by the calibration so far.
+        points_m: (P, 3) the board's points.
+        camera: the calibrated camera.
         corner_sigma_px: standard deviation of a corner.
-        robot_covariance: (6, 6) of a flange pose, m² and rad².
+        robot_covariance: (6, 6) covariance of a flange pose, m² and rad².
     """
 
     T_flange_camera: Transform
@@ -153,7 +153,7 @@ class _Model:
 
     @classmethod
     def of(cls, answer: HandEyeAnswer, points_m: Array, camera: CameraModel, corner_sigma_px: float) -> _Model:
-        """With the robot's noise from the calibration so far."""
+        """Build the model with the robot's noise from the calibration so far."""
         robot = np.diag(
             [max(metres(answer.robot_noise_mm or 0.0), _FLOOR_M) ** 2] * 3
             + [max(np.radians(answer.robot_noise_deg or 0.0), _FLOOR_RAD) ** 2] * 3
@@ -161,7 +161,7 @@ class _Model:
         return cls(answer.T_flange_camera, answer.T_base_board, points_m, camera, corner_sigma_px, robot)
 
     def information(self, flanges: Array) -> Array:
-        """(N, 12, 12) information of each pose (N, 4, 4) about T_flange_camera and T_base_board."""
+        """Return (N, 12, 12) information of each pose (N, 4, 4) about T_flange_camera and T_base_board."""
         if len(flanges) == 0:
             return np.zeros((0, 12, 12))
         X, B = self.T_flange_camera, self.T_base_board
@@ -178,7 +178,7 @@ class _Model:
 
 
 def _covariance_of(information: Array) -> Array:
-    """(C, 6, 6) covariance of T_flange_camera from joint information (C, 12, 12)."""
+    """Return (C, 6, 6) covariance of T_flange_camera from joint information (C, 12, 12)."""
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return (np.linalg.inv(information * both) * both)[:, :6, :6]
@@ -198,7 +198,7 @@ def draw_board_plan(
     points_m: Array,
     camera: CameraModel,
 ) -> bytes:
-    """PNG: cameras as pyramids around the board; taken ones grey, suggested ones in colour with their numbers."""
+    """Draw a PNG of cameras as pyramids around the board; taken ones grey, suggested ones numbered in colour."""
     middle = points_m.mean(axis=0)
     lift = T_base_board.copy()
     lift[:3, 3] = apply(T_base_board, middle)
@@ -260,7 +260,7 @@ def _panel(
 
 
 def _frustum(T: Transform, camera: CameraModel) -> Array:
-    """(5, 3) camera centre and the four image corners, the top edge first."""
+    """Return (5, 3) camera centre and the four image corners, the top edge first."""
     x, y = camera.width / camera.fx / 2, camera.height / camera.fy / 2
     rays = np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]) * _DEPTH_M
     return apply(T, rays)

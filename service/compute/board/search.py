@@ -30,7 +30,7 @@ _PROBED = 4  # images tried before all are searched
 
 @dataclass(frozen=True, slots=True)
 class BoardImage:
-    """What one image file shows; if it cannot be used, `view` is None and `reason` says why."""
+    """The content of one image file; if it cannot be used, `view` is None and `reason` says why."""
 
     size: tuple[int, int]
     view: BoardView | None
@@ -44,7 +44,7 @@ class UsableViews:
     Attributes:
         size: common width and height, px.
         indices: (N) indices of the images.
-        views: (N).
+        views: (N) the views.
         excluded: reason by image index.
     """
 
@@ -92,7 +92,7 @@ def find_boards(
 
 
 def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:
-    """A mistake in the board's description, from a few of the images; None if it is found or nothing explains it."""
+    """Look for a mistake in the board's description in a few images; None if it is found or nothing explains it."""
     some = [files[k] for k in sorted({round(k * (len(files) - 1) / (_PROBED - 1)) for k in range(_PROBED)})]
     greys: list[Grey] = []
     for file in some:
@@ -104,7 +104,7 @@ def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:
 
 
 def usable_views(found: Sequence[BoardImage]) -> UsableViews:
-    """Views in the most common image size; the others are excluded with reasons.
+    """Return the views in the most common image size; the others are excluded with reasons.
 
     Raises:
         ComputeError: the board is in no image.
@@ -133,7 +133,7 @@ def usable_views(found: Sequence[BoardImage]) -> UsableViews:
 
 
 def _worth_processes(files: Sequence[Path]) -> bool:
-    """Whether the work outweighs the start of processes."""
+    """Return whether the work outweighs the start of processes."""
     return len(files) >= _MANY_FILES or sum(file.stat().st_size for file in files if file.is_file()) > _MANY_BYTES
 
 
@@ -168,17 +168,17 @@ _OUTLIER_FLOOR_PX = 0.3
 
 
 def find_part(image: Grey, board: Board, known: BoardKnowledge, T_base_camera: Transform) -> BoardView:
-    """The visible corners of a checkerboard, numbered by their predicted positions.
+    """Find the visible corners of a checkerboard, numbered by their predicted positions.
 
-    Each is refined from its predicted position. It is kept only if it is a crossing of four squares of the right
+    Each is refined from its predicted position. It is accepted only if it is a crossing of four squares of the right
     colours and fits one board pose together with the others. All of them may be shifted by up to a quarter of a
     square.
 
     Args:
         image: grey, 8 bits.
         board: a checkerboard.
-        known: camera, mount and board, from other images.
-        T_base_camera: of this image, from the arm's pose and the mount.
+        known: camera, mount and board as other images show them.
+        T_base_camera: (4, 4) the camera's pose for this image, from the arm's pose and the mount.
 
     Raises:
         ComputeError: too little of the board is visible, or it is not where it was predicted.
@@ -221,14 +221,14 @@ def with_parts(
     known: BoardKnowledge,
     T_base_flange: Array,
 ) -> tuple[BoardImage, ...]:
-    """The images, with parts of the board in those without a whole one; where that failed, the reason says why.
+    """Search images without a whole board for parts of it; where that fails, the reason says why.
 
     Args:
-        images: (N) from `find_boards`.
+        images: (N) results of `find_boards`.
         greys: (N) pixels of the images without a view; None for the others.
         board: a checkerboard.
-        known: from the images with a view.
-        T_base_flange: (N, 4, 4).
+        known: camera, mount and board as the images with a view show them.
+        T_base_flange: (N, 4, 4) poses of the flange.
     """
     out: list[BoardImage] = []
     for image, grey, flange in zip(images, greys, T_base_flange, strict=True):
@@ -248,7 +248,7 @@ def _too_little(count: int) -> ComputeError:
 
 
 def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> float:
-    """Largest possible distance of the corners from their predicted positions, px, from random draws."""
+    """Return the largest possible distance of the corners from their predicted positions, px, from random draws."""
     hands, boards, _, _ = known.draws(_DRAWS)
     flange = T_base_camera @ inverse(known.T_flange_camera)
     ends = board.points()[[0, board.columns - 1, -board.columns, -1]]
@@ -263,7 +263,7 @@ def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> 
 def _crossings(
     image: Grey, grid: Array, which: NDArray[np.int64], found: Array, *, dark_first: bool
 ) -> NDArray[np.bool_]:
-    """(M,) whether two dark and two bright squares meet at each corner, as on the board.
+    """Return (M,) whether two dark and two bright squares meet at each corner, as on the board.
 
     With `dark_first`, the board's first square is dark (the order in which `find_board` numbers it), so a grid that
     is off by one square has the wrong colours.
@@ -287,7 +287,7 @@ def _crossings(
 
 
 def _one_plane(view: BoardView, board: Board, known: BoardKnowledge) -> BoardView:
-    """The view without corners that do not fit one common board pose."""
+    """Return the view without corners that do not fit one common board pose."""
     points = board.points()
     for _ in range(3):
         pose, _ = fit_pose(view, points, known.camera, start_pose(view, points, known.camera))

@@ -1,1 +1,1 @@
-"""How good a registration is: errors at control spheres, loop closures and the error budget."""
+"""Evaluates a registration: errors at control spheres, loop closures and the error budget."""

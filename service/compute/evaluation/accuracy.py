@@ -41,7 +41,7 @@ class ControlSphereError:
     sphere: int
     radial_error_mm: float
     reprojection_error_px: float
-    sigma_mm: float | None = None  # predicted rms of the radial error; None without stated covariances
+    sigma_mm: float | None = None  # predicted rms of the radial error; None without given covariances
     normalised: float | None = None  # rms of its three residuals over their predicted sigmas
 
 
@@ -54,7 +54,7 @@ class Evaluation:
     errors: tuple[ControlSphereError, ...]
 
     def per_sphere(self) -> dict[int, tuple[float, float, int]]:
-        """Sphere → mean radial error (mm), mean reprojection error (px), number of images."""
+        """Map each sphere to its mean radial error (mm), mean reprojection error (px) and number of images."""
         out: dict[int, tuple[float, float, int]] = {}
         for s in sorted({e.sphere for e in self.errors}):
             mine = [e for e in self.errors if e.sphere == s]
@@ -64,7 +64,7 @@ class Evaluation:
 
 
 def radial_errors_m(points: Array, centre_camera_m: Array, radius_m: float) -> Array:
-    """Distances (L,) between the rays through normalised points (L, 2) and the surface of the sphere."""
+    """Return the distances (L,) between the rays through normalised points (L, 2) and the surface of the sphere."""
     rays = np.column_stack([points, np.ones(len(points))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     along = rays @ centre_camera_m
@@ -79,11 +79,11 @@ def evaluate(
     *,
     registration: RegistrationResult | None = None,
 ) -> Evaluation:
-    """Errors of spheres that were not used in the registration.
+    """Compute the errors of spheres that were not used in the registration.
 
     Args:
-        outlines: per image.
-        assignments: per image, outline → index into the control spheres' centres.
+        outlines: the outlines of each image.
+        assignments: outline → index into the control spheres' centres, for each image.
         images: the camera, and registered poses T_scan_camera, metric.
         controls: the control spheres as `centres_m`, with their covariance.
         registration: predicts the errors; its covariance gives `sigma_mm` and `normalised`. The poses must be its
@@ -115,12 +115,12 @@ def evaluate(
 
 
 def leave_one_out(registration: RegistrationResult, *, refined: bool = False) -> Evaluation:
-    """Errors of each registration sphere predicted from the others, for evaluation without control spheres.
+    """Evaluate each registration sphere as predicted from the others, for an evaluation without control spheres.
 
     Args:
-        registration: with its solution, from which each sphere's outlines are removed in turn (one linear step; the
-            weights of the outlines and the variance components stay).
-        refined: whether to predict with the camera poses corrected by their errors, estimated from the other spheres.
+        registration: the registration with its solution, from which each sphere's outlines are removed in turn (one
+            linear step; the weights of the outlines and the variance components stay).
+        refined: true to predict with the camera poses corrected by their errors, estimated from the other spheres.
 
     A sphere without which a station would see fewer than three is left out of the result.
 
@@ -174,7 +174,7 @@ def _without(full: Solution, weights: Array) -> _PartialSolution:
 
 
 def _distances(points: Array, centre: Array, radius_m: float, camera: CameraModel) -> tuple[float, float]:
-    """Mean radial distance in metres and mean reprojection error in px of an outline's points."""
+    """Return the mean radial distance in metres and mean reprojection error in px of an outline's points."""
     radial = radial_errors_m(points, centre, radius_m)
     lifted = np.column_stack([points, np.ones(len(points))])
     distance = np.abs(residuals(lifted, np.broadcast_to(centre, lifted.shape), radius_m, "sampson"))
@@ -184,7 +184,7 @@ def _distances(points: Array, centre: Array, radius_m: float, camera: CameraMode
 def _error(
     member: tuple[int, int, int], distances: tuple[float, float], centre: Array, stated: Prediction | None
 ) -> ControlSphereError:
-    """The record of one outline (image, outline, sphere)."""
+    """Return the record of one outline (image, outline, sphere)."""
     radial_m, reprojection_px = distances
     return ControlSphereError(
         *member,
@@ -204,7 +204,7 @@ def _summary(errors: list[ControlSphereError]) -> Evaluation:
 
 
 def true_error_m(T_scan_camera: Array, T_scan_camera_true: Array, centre_scan_m: Array) -> float:
-    """Distance by which the scene's centre is misplaced when the cameras are aligned to the true ones.
+    """Return the distance by which the scene's centre is misplaced when the cameras are aligned to the true ones.
 
     Args:
         T_scan_camera: (N, 4, 4) registered cameras in the scan frame, metric.

@@ -24,7 +24,7 @@ MOST_WORST_MM = 0.5  # radial error of one control sphere, where the paper's mea
 LEAST_SHARE = 0.5  # of the outlines of one control sphere that should be seen
 _NEAR_RADII = 1.0  # around a place that the images agree on, where the outlines that lack are searched
 _FOUND_SHARE = 0.3  # of a capture's images: in a capture that shows no control sphere in so many, none was placed
-_SIGMAS, _LEAST_DISPLACEMENT_M = 5.0, 0.3e-3  # from which a displacement is told
+_SIGMAS, _LEAST_DISPLACEMENT_M = 5.0, 0.3e-3  # from which a displacement is reported
 
 #: Images, by index, and the cones that are expected in each, with the angle (rad) that each may be off.
 ExpectedNearby = Sequence[tuple[int, Sequence[tuple[Cone, float]]]]
@@ -34,17 +34,18 @@ SearchNearby = Callable[[ExpectedNearby], Sequence[Sequence[SphereOutline]]]
 
 @dataclass(frozen=True, slots=True)
 class ControlSphere:
-    """What one control sphere shows.
+    """The evaluation of one control sphere.
 
     Attributes:
-        index: in the list of control spheres.
+        index: its index in the list of control spheres.
         expected: number of images that should show it.
         measured: number of images in which it was measured.
-        radial_error_mm: mean over its outlines; None if it was not measured.
-        reprojection_error_px: mean over its outlines.
-        displacement_mm: from where scan and registration put it to where the images see it; None below three images.
-        displacement_sigma_mm: of the displacement, as far as the outlines determine it.
-        finding: what is wrong, and what to do; "" if nothing is.
+        radial_error_mm: mean radial error over its outlines; None if it was not measured.
+        reprojection_error_px: mean reprojection error over its outlines.
+        displacement_mm: distance from where scan and registration put it to where the images see it; None below three
+            images.
+        displacement_sigma_mm: standard deviation of the displacement, as far as the outlines determine it.
+        finding: the fault, and the remedy; "" if there is none.
     """
 
     index: int
@@ -67,10 +68,10 @@ class ControlEvaluation:
     """The evaluation by control spheres: the paper's means, and each sphere by itself.
 
     Attributes:
-        means: over all outlines; None if no control sphere was measured.
+        means: the mean errors over all outlines; None if no control sphere was measured.
         spheres: every control sphere that some image should show.
-        outlines: of each image, with those found by the search around the expected places.
-        assignments: of each image, outline → control sphere.
+        outlines: outlines of each image, with those found by the search around the expected places.
+        assignments: outline → control sphere of each image.
         located: the control spheres that at least two images locate, scan frame.
     """
 
@@ -97,11 +98,11 @@ class ControlEvaluation:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What is wrong with control spheres, in words."""
+        """The texts of what is wrong with control spheres."""
         return tuple(s.finding for s in self.spheres if s.finding)
 
     def measures(self) -> dict[str, float]:
-        """The figures that gates judge, by their names in a run."""
+        """Return the figures that gates judge, by their names in a run."""
         out = {
             "control_spheres": float(self.measured),
             "control_spheres_expected": float(len(self.spheres)),
@@ -124,12 +125,14 @@ def evaluate_controls(
     """Find the control spheres in registered images and evaluate the registration by them.
 
     Args:
-        outlines: per image, as the registration had them.
-        taken: per image, outlines that are registration spheres.
-        images: with T_scan_camera, metric; NaN for images without a pose, which count as if they were not there.
+        outlines: the registration's outlines of each image.
+        taken: the outlines of each image that are registration spheres.
+        images: the images with T_scan_camera, metric; NaN for images without a pose, which count as if they were not
+            there.
         spheres: registration and control spheres, scan frame.
-        captures: of each image; of a capture in which control spheres are not seen, none is expected. None: all one.
-        search: searches images for the outlines that lack; None: only `outlines` count.
+        captures: (N,) capture of each image; of a capture in which control spheres are not seen, none is expected.
+            None: all one.
+        search: searches images for the outlines that are missing; None: only `outlines` count.
     """
     posed = np.flatnonzero(np.isfinite(images.poses).all(axis=(1, 2)))
     capture = np.zeros(len(images.poses), dtype=np.int64) if captures is None else np.asarray(captures)
@@ -197,7 +200,7 @@ def _evaluated(
 
 
 def _told(row: ControlSphere, off: dict[int, Array]) -> ControlSphere:
-    """The row with its finding."""
+    """Return the row with its finding."""
     finding, name = "", f"control sphere {row.index}"
     if not row.measured:
         finding = (
@@ -234,7 +237,7 @@ def _told(row: ControlSphere, off: dict[int, Array]) -> ControlSphere:
 def _captures_shown(
     places: dict[int, SeenPlace], capture: NDArray[np.int64], expected: dict[int, list[int]]
 ) -> set[int]:
-    """The captures in which control spheres were placed: those that show one, or all if none does."""
+    """Return the captures in which control spheres were placed: those that show one, or all if none does."""
     out: set[int] = set()
     for c in set(capture.tolist()):
         for s, place in places.items():
@@ -252,7 +255,7 @@ def _lacking(
     images: PosedImages,
     spheres: ScanSpheres,
 ) -> list[tuple[int, list[tuple[Cone, float]]]]:
-    """Where to search for the outlines that lack, by image: near a place that is known, else wide."""
+    """Return where to search for the missing outlines, by image: near a place that is known, else wide."""
     first = len(spheres.centres_m)
     wanted: dict[int, list[tuple[Cone, float]]] = {}
     for s, mine in expected.items():
@@ -280,7 +283,7 @@ WINDOW_M = 0.05  # from its expected place: a sphere that is further away counts
 
 @dataclass(frozen=True, slots=True)
 class SeenPlace:
-    """Where images see a sphere, scan frame, and image → outline of those that do."""
+    """The place at which images see a sphere, scan frame, and image → outline of those that do."""
 
     centre_m: Array
     outlines: dict[int, int]
@@ -297,7 +300,7 @@ class _Rays:
     half: Array  # (K,)
 
     def meeting(self, places: Array, radius_m: float) -> tuple[NDArray[np.bool_], Array]:
-        """Whether rays (K,) show a sphere at places (P, 3), as (P, K), and their distance from it in radii."""
+        """Return whether rays (K,) show a sphere at places (P, 3), as (P, K), and their distance from it in radii."""
         to = places[:, None, :] - self.origin[None]
         distance = np.maximum(np.linalg.norm(to, axis=2), 2 * radius_m)
         half = np.arcsin(radius_m / distance)
@@ -325,7 +328,7 @@ class SeenSpheres:
                 self.outlines[image].append(outline)
 
     def places(self, expected: dict[int, list[int]]) -> dict[int, SeenPlace]:
-        """The place of each control sphere that images show, by its index."""
+        """Return the place of each control sphere that images show, by its index."""
         rays = self._rays()
         seen: list[SeenPlace] = []
         left = np.ones(len(rays.image), dtype=bool)
@@ -348,7 +351,7 @@ class SeenSpheres:
         return {int(s): seen[k] for s, k in zip(rows, columns, strict=True) if cost[s, k] < 1.0}
 
     def _rays(self) -> _Rays:
-        """The free outlines that may be control spheres: near one of them, of its size."""
+        """Return the free outlines that may be control spheres: near one of them, of its size."""
         image: list[int] = []
         outline: list[int] = []
         for i, found in enumerate(self.outlines):
@@ -377,12 +380,12 @@ class SeenSpheres:
 
     @staticmethod
     def _nearest(rays: _Rays, points: Array) -> Array:
-        """(P, K, 3) the point of each ray nearest to each of (P, 3) points."""
+        """Return (P, K, 3) the point of each ray nearest to each of (P, 3) points."""
         along = np.einsum("pki,ki->pk", points[:, None, :] - rays.origin[None], rays.direction)
         return rays.origin[None] + along[..., None] * rays.direction[None]
 
     def _best(self, rays: _Rays, left: NDArray[np.bool_]) -> SeenPlace | None:
-        """The place that most images see, by the outlines left; of equal ones, where they agree best."""
+        """Return the place that most images see, by the outlines left; of equal ones, where they agree best."""
         which = np.flatnonzero(left)
         mine = _Rays(
             rays.image[which], rays.outline[which], rays.origin[which], rays.direction[which], rays.half[which]
@@ -411,7 +414,7 @@ class SeenSpheres:
         return SeenPlace(found, self._shown(mine, found) or outlines)
 
     def _single(self, rays: _Rays) -> Array:
-        """Places by single outlines, each where it comes nearest to a control sphere, for a capture of few images."""
+        """Return places by single outlines, each where it comes nearest to a control sphere, for few images."""
         if len(set(rays.image.tolist())) > 2:
             return np.zeros((0, 3))
         return self._nearest(rays, self._spheres.control_m).reshape(-1, 3)
@@ -433,7 +436,7 @@ class SeenSpheres:
 
 
 def _crossings(rays: _Rays, radius_m: float) -> Array:
-    """(P, 3) where pairs of rays of two images pass each other closely."""
+    """Return (P, 3) where pairs of rays of two images pass each other closely."""
     a, b = np.triu_indices(len(rays.image), 1)
     other = rays.image[a] != rays.image[b]
     a, b = a[other], b[other]

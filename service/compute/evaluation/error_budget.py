@@ -52,7 +52,7 @@ class Alignment:
     covariance: Array = field(repr=False)
 
     def covariance_at_m2(self, points_b_m: Array) -> Array:
-        """(n, 3, 3) covariance, in the axes of a, that the alignment's error adds to points (n, 3) of b."""
+        """Return (n, 3, 3) covariance, in the axes of a, that the alignment's error adds to points (n, 3) of b."""
         J = place_jacobian(points_b_m @ self.T_a_b[:3, :3].T)
         return J @ self.covariance @ J.transpose(0, 2, 1)
 
@@ -66,14 +66,14 @@ def locate_in_images(
     *,
     least_images: int = 3,
 ) -> dict[int, TriangulatedSphere]:
-    """Centres of spheres from their outlines and the registered cameras, each sphere on its own.
+    """Locate the centres of spheres from their outlines and the registered cameras, each sphere on its own.
 
     Weighted least squares of the cones' three parameters (`ObservedCones`); outlines more than 4 sigma from the
     others of their sphere are excluded. The covariance follows from the outlines', inflated if they scatter more.
 
     Args:
-        outlines: per image.
-        assignments: per image, outline → index into `starts_scan_m`.
+        outlines: the outlines of each image.
+        assignments: outline → index into `starts_scan_m`, for each image.
         T_scan_camera: (N, 4, 4), metric.
         starts_scan_m: (M, 3) approximate centres.
         radius_m: radius of the spheres.
@@ -123,7 +123,7 @@ def _intersect(
 
 
 def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> Closure:
-    """Closure of two measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
+    """Compare two measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
     r = a - b
     C = covariance_a + covariance_b
     square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(C), r)
@@ -136,7 +136,7 @@ def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Arra
 
 
 def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> tuple[Closure, Alignment]:
-    """Closure of two constellations (n, 3) of the same spheres in different frames, and the aligning T_a_b.
+    """Compare two constellations (n, 3) of the same spheres in different frames; return the aligning T_a_b too.
 
     The alignment is weighted by the covariances (n, 3, 3), m²; its six degrees of freedom are subtracted.
 
@@ -217,7 +217,7 @@ class Observation:
 
     @property
     def verdict(self) -> str:
-        """Whether the stated covariances agree with the observation, in words."""
+        """The text that says whether the given covariances agree with the observation."""
         low, high = HONEST
         if self.normalised_chi2 > high:
             factor = float(np.sqrt(self.normalised_chi2))
@@ -255,7 +255,7 @@ class ErrorBudget:
 def contributions(
     registration_m: Mapping[str, float], scan: MeasuredSpheres, ct: MeasuredSpheres | None
 ) -> tuple[Contribution, ...]:
-    """Every source of error at a target; `registration_m` holds the registration's components there, as 3D sigmas.
+    """List every source of error at a target; `registration_m` holds the registration's part there, as 3D sigmas.
 
     The total is for a point of the scan's surface in the images: the registration's components and the scan's own
     noise. The CT is listed but not counted, since it only matters where its surface is used.
@@ -276,7 +276,7 @@ def contributions(
 def control_observation(
     registration: Alignment, seen: Mapping[int, TriangulatedSphere], control: MeasuredSpheres
 ) -> Observation:
-    """Control spheres located in the images, compared with their positions by scan and registration.
+    """Return the control spheres located in the images, compared with their positions by scan and registration.
 
     Control and registration spheres are seen by the same camera, so an error that moves all outlines alike moves both
     and cancels.
@@ -302,7 +302,7 @@ def control_observation(
 def loop_observations(
     seen: Mapping[int, TriangulatedSphere], scan: MeasuredSpheres, ct_in_scan_order: MeasuredSpheres | None
 ) -> tuple[Observation, ...]:
-    """Closures camera ↔ scan, scan ↔ CT and camera ↔ CT: shapes of the spheres that each pair shares.
+    """Return the closures camera ↔ scan, scan ↔ CT and camera ↔ CT: shapes of the spheres that each pair shares.
 
     Three pairs instead of one loop, because alignments on the same spheres cancel one another whatever their errors.
 

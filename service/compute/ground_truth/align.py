@@ -24,8 +24,8 @@ class TransformLoop:
 
     Attributes:
         T_scan_scan: the way around the loop; the identity if both agree.
-        rotation_rad: of it.
-        rms_m, worst_m: displacement of the points that it was judged at.
+        rotation_rad: its angle.
+        rms_m, worst_m: displacement of the points at which it was judged.
     """
 
     T_scan_scan: Transform = field(repr=False)
@@ -40,7 +40,7 @@ def close_transforms(
     """Go from the scan to the CT by the spheres, and back by the cameras.
 
     Args:
-        T_scan_ct: from sphere to sphere.
+        T_scan_ct: the transform by the spheres of both.
         T_world_scan, T_world_ct: image-based registrations of the two meshes.
         points_scan_m: (N, 3) where the difference matters, such as the spheres or the specimen.
     """
@@ -55,8 +55,8 @@ class DistanceChange:
 
     Attributes:
         worst: the two spheres whose distance changed most.
-        worst_m: that change, without its sign: what the gate judges.
-        rms_m: of all changes.
+        worst_m: size of that change, which the gate judges.
+        rms_m: root mean square of all changes.
     """
 
     worst: tuple[int, int]
@@ -70,7 +70,7 @@ def distance_changes(before_m: Array, after_m: Array, pairs: Sequence[tuple[int,
     Args:
         before_m: (M, 3) centres in one frame.
         after_m: (N, 3) centres in another.
-        pairs: (index before, index after) of the spheres that both hold.
+        pairs: (index before, index after) of the spheres in both.
 
     Raises:
         ComputeError: fewer than two common spheres.
@@ -102,11 +102,11 @@ class Aligned:
     """A CT in the frame of a scan.
 
     Attributes:
-        T_scan_ct: from the spheres that did not move.
-        covariance: (6, 6) of T_scan_ct, as in `evaluation.closure.Alignment`.
+        T_scan_ct: (4, 4) by the spheres that did not move.
+        covariance: (6, 6) covariance of T_scan_ct, as in `evaluation.error_budget.Alignment`.
         loop: the spheres one by one.
         distances: their distances before (CT) and after (scan) the transport.
-        only_ct: spheres, by their numbers in the CT, that the scan lacks.
+        only_ct: spheres, by their numbers in the CT, that are missing in the scan.
         taken_away_m: (K, 3) centres of these, in the frame of the scan.
         scan_spheres_m: (M, 3) centres in the scan.
         sigma_ct_m, sigma_scan_m: median rms of the surface of the spheres in each: its noise.
@@ -124,7 +124,7 @@ class Aligned:
 
     @property
     def passed(self) -> bool:
-        """Whether no distance changed by more than the gate allows."""
+        """True if no distance changed by more than the gate allows."""
         return self.distances.worst_m <= TRANSPORT_GATE_M
 
 
@@ -132,7 +132,7 @@ def align(ct: Surface, scan: Surface, radius_m: float) -> Aligned:
     """Find the spheres of a radius in both meshes and register them.
 
     Raises:
-        ComputeError: spheres are lacking, or the two constellations do not agree.
+        ComputeError: spheres are missing, or the two constellations do not agree.
     """
     return align_spheres(_located(ct, radius_m), _located(scan, radius_m))
 
@@ -179,7 +179,7 @@ class CommonPart:
 
 
 def common_part(ct: Surface, aligned: Aligned, radius_m: float) -> CommonPart:
-    """Leave out of a CT, in the scan's frame, the spheres of a radius that the scan lacks, and small loose parts."""
+    """Leave out of a CT, in the scan's frame, the spheres of a radius missing in the scan, and small loose parts."""
     taken = SphereRegion(aligned.taken_away_m, radius_m + _MARGIN_M)
     left = outside(ct, taken)
     del ct

@@ -26,7 +26,7 @@ class Samples:
     """Points on a surface.
 
     Attributes:
-        points_m: (N, 3).
+        points_m: (N, 3) the samples' places.
         origin: (N,) index of the face that each point lies on, or of the cloud's point.
         normals: (N, 3) unit normals; None for a cloud without.
     """
@@ -66,7 +66,7 @@ class BlockedSamples:
         return tuple(min(_BLOCK, self.n - begin) for begin in range(0, self.n, _BLOCK))
 
     def blocks(self, some: Sequence[IntArray] | None = None) -> Iterator[Samples]:
-        """All samples in order, in blocks of up to a million; the same ones each time.
+        """Yield all samples in order, in blocks of up to a million; the same ones each time.
 
         `some` chooses from each block by their numbers in it (K,), in order; a block of which none is wanted is left
         out.
@@ -85,7 +85,7 @@ class BlockedSamples:
             yield Samples(_places(self._surface, origin, drawn if some is None else drawn[:, chosen]), origin, None)
 
     def regions(self) -> Iterator[Samples]:
-        """All samples, those together that lie together, without normals; a region is larger than a block.
+        """Yield all samples, those together that lie together, without normals; a region is larger than a block.
 
         In a file whose faces have no spatial order, each block is spread over the whole surface.
         """
@@ -115,7 +115,7 @@ class BlockedSamples:
 
 
 def _overlap(places: Array, runs: int) -> bool:
-    """Whether boxes around so many runs of consecutive places (N, 3) overlap as those of an order in space do not."""
+    """Return whether boxes around runs of consecutive places (N, 3) overlap more than in an order by space."""
     whole = np.ptp(places, axis=0)
     thickness = 0.01 * float(whole.max())  # at least; a plane has none
     boxes = [np.prod(np.ptp(run, axis=0) + thickness) for run in np.array_split(places, runs)]
@@ -123,7 +123,7 @@ def _overlap(places: Array, runs: int) -> bool:
 
 
 def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
-    """Points and origins of several blocks, which are left out of the list so that they are not there twice."""
+    """Return points and origins of several blocks, and take them off the list so that they are not there twice."""
     points_m = np.concatenate([block.points_m for block in some])
     origin = np.concatenate([block.origin for block in some])
     some.clear()
@@ -131,7 +131,7 @@ def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
 
 
 def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:
-    """All samples of a surface at once. Raises as BlockedSamples."""
+    """Return all samples of a surface at once. Raises as BlockedSamples."""
     blocks = list(BlockedSamples(surface, spacing_m, rng).blocks())
     normals = [block.normals for block in blocks if block.normals is not None]
     return Samples(
@@ -142,7 +142,7 @@ def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samp
 
 
 def _counts(surface: Surface, spacing_m: float, rng: np.random.Generator) -> IntArray:
-    """(F,) number of samples on each face and those before it."""
+    """Return (F,) number of samples on each face and those before it."""
     area = surface.face_areas_m2
     total = area.sum() / spacing_m**2
     if not total > 0:
@@ -160,26 +160,26 @@ def _counts(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Int
 
 
 def random_points(surface: Surface, n: int, rng: np.random.Generator) -> Array:
-    """(n, 3) points of a mesh, independent of one another and uniform in area."""
+    """Return (n, 3) points of a mesh, independent of one another and uniform in area."""
     share = np.cumsum(surface.face_areas_m2)
     chosen = np.searchsorted(share, rng.random(n) * share[-1], side="right")
     return random_places(surface, np.minimum(chosen, len(share) - 1), rng)
 
 
 def normals_at(surface: Surface, origin: IntArray) -> Array | None:
-    """Unit normals (K, 3) of samples of this origin (K,); None where the surface is a cloud without normals."""
+    """Return unit normals (K, 3) of samples of this origin (K,); None if the surface is a cloud without normals."""
     if surface.is_mesh:
         return surface.normals_of(origin)
     return None if surface.normals is None else surface.normals[origin]
 
 
 def random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
-    """(K, 3) one random point on each of these faces (K,)."""
+    """Return (K, 3) one random point on each of these faces (K,)."""
     return _places(surface, faces, rng.random((2, len(faces))))
 
 
 def _places(surface: Surface, faces: IntArray, drawn: Array) -> Array:
-    """(K, 3) the point on each of these faces (K,) that two numbers drawn from 0 to 1 (2, K) stand for."""
+    """Return (K, 3) the point on each of these faces (K,) that two numbers drawn from 0 to 1 (2, K) stand for."""
     out = np.empty((len(faces), 3))
     for begin in range(0, len(faces), _PLACES):
         of, (u, v) = faces[begin : begin + _PLACES], drawn[:, begin : begin + _PLACES]
@@ -230,7 +230,7 @@ _PREVIEW = 10  # of so many of them, one is looked at first: a good bound makes 
 
 @dataclass(frozen=True, slots=True)
 class ChamferSettings:
-    """How two surfaces are compared; the defaults are the paper's.
+    """The settings by which two surfaces are compared; the defaults are the paper's.
 
     `to_faces`: also measure the distances to the faces, which takes most of the time with large meshes.
     `of_vertices`: also measure those of the vertices of the surface that is judged, for a heat map of it.
@@ -250,14 +250,14 @@ class Direction:
 
     Attributes:
         n: samples whose distances were measured, MOST_COMPARED at most.
-        excluded: of these, those farther than the outlier limit; in no mean, but in the denominator of `within`.
-        mean_m: mean distance to the nearest sample of the other surface: the paper's figure.
-        median_m, p95_m: of the same distances.
-        within: for each threshold, the share of all samples that have the other surface within it.
+        excluded: number of these farther than the outlier limit; in no mean, but in the denominator of `within`.
+        mean_m: mean distance to the nearest sample of the other surface, which the paper reports.
+        median_m, p95_m: median and 95th percentile of the same distances.
+        within: share of all samples that have the other surface within each threshold.
         floor_m: mean distance from a random place of the other surface to its own nearest sample: what `mean_m`
             would be if the surfaces were equal.
-        surface_mean_m, surface_rms_m: of the distances to the other's faces (exact, of `CHECKED` samples at most);
-            None if the other is a cloud, or if they were not asked for.
+        surface_mean_m, surface_rms_m: mean and root mean square of the distances to the other's faces (exact, of
+            `CHECKED` samples at most); None if the other is a cloud, or if they were not asked for.
         normal_consistency: mean |cosine| between the normals of a sample and its nearest; None without normals.
     """
 
@@ -283,15 +283,15 @@ class DistanceSamples:
 
 @dataclass(frozen=True, slots=True)
 class ChamferScore:
-    """Two surfaces compared.
+    """The result of a comparison of two surfaces.
 
     Attributes:
         pred_to_gt: accuracy: from the surface judged to the truth.
         gt_to_pred: completeness: from the truth to the surface judged.
-        thresholds_m: of the F-score.
+        thresholds_m: distance thresholds of the F-score.
         pred, gt: the samples with their distances.
-        vertex_distance_m: (V,) from the vertices of the surface judged to the samples of the truth, infinite beyond
-            the limit; None if not asked for.
+        vertex_distance_m: (V,) distances from the vertices of the surface judged to the samples of the truth,
+            infinite beyond the limit; None if not asked for.
     """
 
     pred_to_gt: Direction
@@ -308,7 +308,7 @@ class ChamferScore:
 
     @property
     def floor_m(self) -> float:
-        """What `chamfer_m` would be, by the sampling alone, if the surfaces were equal."""
+        """The `chamfer_m` that the sampling alone would give if the surfaces were equal."""
         return 0.5 * (self.pred_to_gt.floor_m + self.gt_to_pred.floor_m)
 
     @property
@@ -345,7 +345,7 @@ def chamfer(pred: Surface, gt: Surface, settings: ChamferSettings | None = None)
 
 
 def _compared(samples: BlockedSamples, seed: int) -> Samples:
-    """The samples whose distances are measured: all, or MOST_COMPARED at random, the same share of each block."""
+    """Select the samples whose distances are measured: all, or MOST_COMPARED at random, the same share of a block."""
     rng = np.random.default_rng([seed, samples.n])  # of its own: the other draws do not depend on it
     share = min(1.0, MOST_COMPARED / samples.n)
     some: list[IntArray] | None = None
@@ -363,7 +363,7 @@ def _compared(samples: BlockedSamples, seed: int) -> Samples:
 def _nearest(
     targets: BlockedSamples, some: Samples, queries: tuple[Array, Array, Array], outlier_m: float
 ) -> tuple[NearestOfBlocks, NearestOfBlocks, NearestOfBlocks]:
-    """The nearest of all samples of a surface for three sets of queries (Q, 3), by the face or point they are on.
+    """Find the nearest of all samples of a surface for three sets of queries (Q, 3), by their face or point.
 
     The second set lies on that surface itself, and has no limit. `some` of the samples are looked at first.
     """
@@ -381,7 +381,7 @@ def _mean(nearest: NearestOfBlocks) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """From samples of one surface to the nearest of all samples of another."""
+    """The samples of one surface with the nearest of all samples of another."""
 
     source: Surface
     samples: Samples
@@ -438,7 +438,7 @@ def _consistency(way: _Way, chosen: IntArray) -> float | None:
 
 
 def _floor_places(surface: Surface, samples: BlockedSamples, rng: np.random.Generator) -> Array:
-    """Random places (N, 3) of a surface, whose mean distance from its nearest samples is the floor."""
+    """Return random places (N, 3) of a surface, whose mean distance from its nearest samples is the floor."""
     n = min(CHECKED, samples.n)
     if surface.is_mesh:
         return random_points(surface, n, rng)

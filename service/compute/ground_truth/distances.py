@@ -14,7 +14,7 @@ from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.geometry import Array
 
 _CHUNK = 1_000_000  # queries at a time, which limits the memory
-_PROBE = 4096  # consecutive points that are looked at to tell whether their order is spatial
+_PROBE = 4096  # consecutive points by which to decide whether their order is spatial
 _NEAR = 0.02  # of the extent: a usual step between consecutive points in spatial order is shorter
 _CELLS = 128  # along the longest side of a block of points, in the grid that says how far it is
 _GROUP = 4096  # queries that lie together
@@ -30,7 +30,7 @@ class PointIndex:
         self._tree = KDTree(np.ascontiguousarray(points, dtype=np.float64))
 
     def nearest(self, queries_m: Array, within_m: float = np.inf) -> tuple[Array, IntArray]:
-        """Distance (Q,) in metres from each query (Q, 3) to the nearest point, and that point's index (Q,).
+        """Return the distance (Q,) in metres from each query (Q, 3) to the nearest point, and that point's index.
 
         With no point nearer than `within_m`, the distance is infinite and the index -1. A bound makes the search
         many times faster for queries that are far from all points.
@@ -51,7 +51,7 @@ class PointIndex:
         return distance, index
 
     def neighbours(self, queries_m: Array, k: int) -> IntArray:
-        """(Q, k) indices of the k points nearest to each query (Q, 3), the nearest first."""
+        """Return (Q, k) indices of the k points nearest to each query (Q, 3), the nearest first."""
         index = self._tree.query(np.ascontiguousarray(queries_m, dtype=np.float64), k=k)[1].astype(np.int64)
         return index if self._order is None else self._order[index]
 
@@ -60,8 +60,9 @@ class NearestOfBlocks:
     """The nearest of many points that are shown block by block, so that never all of them are in memory.
 
     Attributes:
-        distance_m: (Q,) from each query to the nearest point shown so far; infinite if none is within the limit.
-        label: (Q,) of that point; -1 if there is none.
+        distance_m: (Q,) distance from each query to the nearest point shown so far; infinite if none is within the
+            limit.
+        label: (Q,) label of that point; -1 if there is none.
     """
 
     def __init__(self, queries_m: Array, within_m: float = np.inf) -> None:
@@ -76,7 +77,7 @@ class NearestOfBlocks:
         self._middles, self._radii = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
     def asked(self, block: Block) -> IntArray:
-        """Indices of the queries to which a point of a block may be the nearest."""
+        """Return the indices of the queries to which a point of a block may be the nearest."""
         reach = np.array([float(self.distance_m[group].max()) for group in self._groups])
         near = np.flatnonzero(block.least_distance(self._middles) - self._radii < np.minimum(reach, self._within))
         found: list[IntArray] = [np.zeros(0, dtype=np.int64)]
@@ -120,14 +121,14 @@ class Block:
         self._apart = self._cell * np.maximum(apart.ravel() - 1.0, 0.0)
 
     def _cells(self, inside: Sequence[Array]) -> IntArray:
-        """(N,) the number of the cell of each place, given by its three coordinates (N,)."""
+        """Return (N,) the number of the cell of each place, given by its three coordinates (N,)."""
         number = np.zeros(len(inside[0]), dtype=np.int64)
         for x, low, size in zip(inside, self._low, self._size, strict=True):
             number = number * size + np.minimum((x - low) / self._cell, size - 1).astype(np.int64)
         return number
 
     def least_distance(self, places_m: Array) -> Array:
-        """(Q,) a distance than which no point of the block is nearer to a place (Q, 3)."""
+        """Return (Q,) a distance than which no point of the block is nearer to a place (Q, 3)."""
         inside = [np.clip(places_m[:, k], self._low[k], self._high[k]) for k in range(3)]
         # The box is convex: the way to a point in it is at least as long as both legs of a right angle.
         beside = sum(((places_m[:, k] - inside[k]) ** 2 for k in range(3)), self._apart[self._cells(inside)] ** 2)
@@ -135,7 +136,7 @@ class Block:
 
 
 def spatial_order(points: Array) -> IntArray | None:
-    """An order (N,) along a Z curve; None if consecutive points (N, 3) are mostly neighbours already."""
+    """Return an order (N,) along a Z curve; None if consecutive points (N, 3) are mostly neighbours already."""
     if len(points) < _PROBE:
         return None
     begin = np.linspace(0, len(points) - 2, _PROBE).astype(np.int64)
@@ -147,7 +148,7 @@ def spatial_order(points: Array) -> IntArray | None:
 
 
 def z_order(points: Array) -> IntArray:
-    """The order (N,) of points (N, 3) along a Z curve, so that neighbours are mostly near one another."""
+    """Return the order (N,) of points (N, 3) along a Z curve, so that neighbours are mostly near one another."""
     low = points.min(axis=0)
     extent = max(float(np.max(points.max(axis=0) - low)), 1e-300)
     keys = np.empty(len(points), dtype=np.uint64)
@@ -159,7 +160,7 @@ def z_order(points: Array) -> IntArray:
 
 
 def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The 21 lowest bits with two zeros between each: a Morton code's part."""
+    """Return the 21 lowest bits with two zeros between each: a Morton code's part."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -213,7 +214,7 @@ class TriangleTree:
         """Find the point of the surface nearest to each query (Q, 3).
 
         Args:
-            queries_m: (Q, 3).
+            queries_m: (Q, 3) the queries' places.
             bounds_m: (Q,) distances from each query to some place of the surface, such as a sample of it. The
                 closer these are to the answer, the faster it is found; None: found by descending the tree.
         """
@@ -230,7 +231,7 @@ class TriangleTree:
         return out
 
     def _descended(self, queries: Array) -> Array:
-        """(Q,) distance to a face that is found by always taking the nearer box."""
+        """Return (Q,) distance to a face that is found by always taking the nearer box."""
         at = np.zeros(len(queries), dtype=np.int64)
         for low, high in self._levels[-2::-1]:
             left, right = 2 * at, np.minimum(2 * at + 1, len(low) - 1)
@@ -239,7 +240,7 @@ class TriangleTree:
         return self._closest(queries, np.arange(len(queries)), at)[0]
 
     def _candidates(self, queries: Array, bounds: Array) -> tuple[IntArray, IntArray]:
-        """All pairs of a query and a leaf whose box is within the query's bound, sorted by query."""
+        """Return all pairs of a query and a leaf whose box is within the query's bound, sorted by query."""
         query = np.arange(len(queries))
         node = np.zeros(len(queries), dtype=np.int64)
         for low, high in self._levels[-2::-1]:
@@ -272,12 +273,12 @@ class TriangleTree:
 
 
 def _box_distance(points: Array, low: Array, high: Array) -> Array:
-    """(N,) distance from points (N, 3) to boxes with these corners (N, 3)."""
+    """Return (N,) distance from points (N, 3) to boxes with these corners (N, 3)."""
     return np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
 
 
 def closest_on_triangles(points: Array, corners: Array) -> Array:
-    """(N, 3) the place of each triangle (N, 3, 3) that is nearest to its point (N, 3).
+    """Return (N, 3) the place of each triangle (N, 3, 3) that is nearest to its point (N, 3).
 
     Source: Ericson, Real-Time Collision Detection, 2005, section 5.1.5, on arrays.
     """

@@ -54,11 +54,11 @@ _STIFF = (
 
 @dataclass(frozen=True, slots=True)
 class FieldLengths:
-    """How smooth the field is.
+    """The lengths that make the field smooth.
 
     Attributes:
-        smoothing_m: over which the field averages the scan's noise.
-        reach_m: over which it decays where the scan shows nothing.
+        smoothing_m: length over which the field averages the scan's noise.
+        reach_m: length over which it decays where the scan shows nothing.
     """
 
     smoothing_m: float = 0.0007
@@ -68,7 +68,7 @@ class FieldLengths:
 def _deviation_field(
     surface: Surface, links: csr_matrix, known_m: Array, known: Mask, lengths: FieldLengths
 ) -> Array:
-    """(V,) metres: follows `known_m` where it is `known`, and decays from there along the surface.
+    """Return (V,) metres that follow `known_m` where it is `known`, and decay from there along the surface.
 
     It minimises the squared differences over the edges, with weights towards the known values and, elsewhere, 0.
 
@@ -77,7 +77,7 @@ def _deviation_field(
         links: its `_adjacency`.
         known_m: (V,) deviations, along the normals.
         known: (V,) where they count.
-        lengths: of smoothing and decay.
+        lengths: the lengths of smoothing and decay.
 
     Raises:
         ComputeError: the solver does not converge.
@@ -96,7 +96,7 @@ def _deviation_field(
 
 
 def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = None) -> tuple[Surface, int]:
-    """The surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
+    """Return the surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
 
     Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
     neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
@@ -138,7 +138,7 @@ def moved_unfolded(surface: Surface, move_m: Array, known: csr_matrix | None = N
 
 
 def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -> tuple[Array, IntArray]:
-    """(V,) share with which each vertex moves as a part of its piece, and (V,) the piece's number.
+    """Return (V,) share with which each vertex moves as a part of its piece, and (V,) the piece's number.
 
     The share is 1 at the corners of the folded faces and their neighbours, and passes to 0 over `rings` rings.
     """
@@ -153,7 +153,7 @@ def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -
 
 
 def _adjacency(surface: Surface) -> csr_matrix:
-    """(V, V) 1 for each pair of vertices with an edge between them."""
+    """Return (V, V) 1 for each pair of vertices with an edge between them."""
     f, n = surface.faces, len(surface.vertices_m)
     begun = np.zeros(n + 1, dtype=np.int64)
     for k in range(3):
@@ -184,7 +184,7 @@ def _usual_edge(surface: Surface) -> float:
 
 
 def _folded(surface: Surface, points_m: Array, of: IntArray) -> IntArray:
-    """Those of some faces whose normal turns by more than a right angle when the vertices move to these points."""
+    """Select faces whose normal turns by more than a right angle when the vertices move to these points."""
     moved = Surface(points_m, surface.faces)
     folded = np.empty(len(of), dtype=np.bool_)
     for begin in range(0, len(of), FACES):
@@ -205,7 +205,7 @@ _VERTICES = 200_000  # computed at a time, which limits the memory
 
 
 class Source(IntEnum):
-    """Where a vertex comes from."""
+    """The origin of a vertex."""
 
     CT = 0
     SCAN = 1
@@ -214,16 +214,17 @@ class Source(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
-    """How two meshes are fused.
+    """The settings of the fusion of two meshes.
 
     Attributes:
         blend_m: width of the overlap over which the weight rises.
         sigma_ct_m, sigma_scan_m: least standard deviation of each surface along its normal, as of its spheres.
-        alignment_covariance: (6, 6) of T_scan_ct as in `evaluation.closure.Alignment`; None: known exactly.
-        keep_scan_only: whether parts of the scan that the CT lacks are added, unconnected.
+        alignment_covariance: (6, 6) covariance of T_scan_ct as in `evaluation.error_budget.Alignment`; None: known
+            exactly.
+        keep_scan_only: true to add parts of the scan that are missing in the CT, unconnected.
         least_part_m2: smaller unconnected parts of the CT are left out.
         overlap, wound: limits.
-        lengths: of the field by which the CT follows the scan.
+        lengths: lengths of the field by which the CT follows the scan.
     """
 
     blend_m: float = 0.003
@@ -239,18 +240,18 @@ class FusionSettings:
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """The ground truth.
+    """The fused ground-truth mesh, with the source, weight and noise of each vertex.
 
     Attributes:
-        surface: in the frame of the sources.
-        source: (V,) of Source.
-        weight: (V,) of the scan, 0 to 1.
+        surface: the fused mesh, in the frame of the sources.
+        source: (V,) the Source of each vertex.
+        weight: (V,) weight of the scan, 0 to 1.
         sigma_m: (V,) standard deviation along the normal.
-        wound: (V,) in the wound region, as proposed and corrected.
+        wound: (V,) true in the wound region, as proposed and corrected.
         ct_offset_m: median height of the CT above the scan, outside the wound: its bias if the scan is right.
         ct_spread_m: robust standard deviation of the same heights.
-        folded: faces that could not be kept from turning over when their vertices moved.
-        corrections: that were applied.
+        folded: number of faces that could not be prevented from turning over when their vertices moved.
+        corrections: the corrections that were applied.
     """
 
     surface: Surface
@@ -264,7 +265,7 @@ class Fused:
     corrections: tuple[RegionCorrection, ...]
 
     def share(self, source: Source) -> float:
-        """Share of the vertices from this source."""
+        """Return the share of the vertices from this source."""
         return float(np.mean(self.source == source))
 
 
@@ -279,12 +280,12 @@ def fuse(
     """Fuse a CT mesh and a scan.
 
     Args:
-        ct: in the scan's frame, vertices shared between faces, outward faces.
-        scan: where it has holes, and in the wound, the CT is taken.
+        ct: the CT's mesh in the scan's frame, vertices shared between faces, outward faces.
+        scan: the scan's mesh; where it has holes, and in the wound, the CT is taken.
         up: (3,) direction away from the table; it distinguishes hollows from undersides.
         settings: the defaults if None.
         corrections: regions that people drew.
-        removed: where the CT shows something that was taken away before the scan; there only the scan counts.
+        removed: region where the CT shows something that was taken away before the scan; there only the scan counts.
 
     Raises:
         ComputeError: a source has no faces, or the two agree nowhere.
@@ -324,13 +325,13 @@ def fuse(
 
 
 def _smooth_step(x: Array) -> Array:
-    """0 up to 0, 1 from 1 on, with continuous curvature between."""
+    """Rise from 0 at 0 and below to 1 at 1 and beyond, with continuous curvature between."""
     t = np.clip(x, 0.0, 1.0)
     return t**3 * (10 + t * (6 * t - 15))
 
 
 def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, settings: FusionSettings) -> Array:
-    """(V,) standard deviation along the normal; where both count, their disagreement does, too."""
+    """Return (V,) standard deviation along the normal; where both count, their disagreement does, too."""
     ct = np.full(len(weight), sigma_ct_m**2)
     if settings.alignment_covariance is not None:
         normals = carrier.vertex_normals
@@ -343,7 +344,7 @@ def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, setti
 
 
 def without_specks(ct: Surface, least_m2: float) -> Surface:
-    """The CT without small unconnected parts (noise) and without vertices that no face has."""
+    """Return the CT without small unconnected parts (noise) and without vertices that no face has."""
     if not ct.is_mesh:
         raise ComputeError("fusion needs a mesh of the CT", remedy="Extract its surface first")
     if least_m2 <= 0:
@@ -355,7 +356,7 @@ def without_specks(ct: Surface, least_m2: float) -> Surface:
 
 
 def outside(surface: Surface, region: Region) -> Surface:
-    """The surface without the faces that touch a region."""
+    """Return the surface without the faces that touch a region."""
     inside = region.contains(surface.vertices_m)
     if not inside.any():
         return compact(surface.vertices_m, surface.faces)[0]
@@ -363,7 +364,7 @@ def outside(surface: Surface, region: Region) -> Surface:
 
 
 def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
-    """The mesh without vertices that no face has, and the former index (V,) of each that is left."""
+    """Return the mesh without vertices that no face has, and the former index (V,) of each that is left."""
     used = np.zeros(len(vertices), dtype=np.bool_)
     used[faces.ravel()] = True
     kept = np.flatnonzero(used)
@@ -380,7 +381,7 @@ class _Addition:
     removed: Region | None
 
     def taken(self, carrier: Surface) -> Mask:
-        """(F,) faces of the scan that are far from the CT, or touch what was taken away since."""
+        """Return (F,) faces of the scan that are far from the CT, or touch what was taken away since."""
         far_m = 2 * self.settings.overlap.distance_m
         vertices = self.scan.vertices_m
         far = PointIndex(carrier.vertices_m).nearest(vertices, far_m)[0] > far_m
@@ -391,7 +392,7 @@ class _Addition:
 
 
 def _with_scan_only(fused: Fused, carrier: Surface, addition: _Addition) -> Fused:
-    """Add the faces of the scan that the CT lacks, as separate parts."""
+    """Add the faces of the scan missing in the CT, as separate parts."""
     scan, settings = addition.scan, addition.settings
     extra, _ = compact(scan.vertices_m, scan.faces[addition.taken(carrier)])
     n = len(extra.vertices_m)
@@ -418,12 +419,12 @@ class Markers:
     """Spheres on posts, in the frame of the mesh.
 
     Attributes:
-        centres_m: (M, 3).
-        radius_m: of the spheres.
+        centres_m: (M, 3) the spheres' centres.
+        radius_m: radius of the spheres.
         up: (3,) along the posts, away from the table.
-        post_radius_m: of the posts; 0: there are none.
-        post_length_m: below the centres.
-        margin_m: cut around both.
+        post_radius_m: radius of the posts; 0: there are none.
+        post_length_m: length of the posts below the centres.
+        margin_m: width that is cut away around both.
     """
 
     centres_m: Array
@@ -434,7 +435,7 @@ class Markers:
     margin_m: float = 0.002
 
     def near(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) are on a sphere or a post, or within the margin of one."""
+        """Return (N,) which points (N, 3) are on a sphere or a post, or within the margin of one."""
         up = self.up / np.linalg.norm(self.up)
         out = np.zeros(len(points_m), dtype=np.bool_)
         for centre in self.centres_m:
@@ -448,7 +449,7 @@ class Markers:
 
 
 def without_markers(fused: Fused, markers: Markers) -> Fused:
-    """The ground truth without the faces that touch a sphere or a post; where they stood it is open."""
+    """Return the ground truth without the faces that touch a sphere or a post; where they stood it is open."""
     near = markers.near(fused.surface.vertices_m)
     surface, kept = compact(fused.surface.vertices_m, fused.surface.faces[~fused.surface.touching(near)])
     return replace(

@@ -40,13 +40,13 @@ class HeatScale:
 
     @classmethod
     def of(cls, score: ChamferScore, outlier_m: float) -> HeatScale:
-        """The scale whose end is the 95th percentile of both directions, rounded up to 1, 2 or 5."""
+        """Return the scale whose end is the 95th percentile of both directions, rounded up to 1, 2 or 5."""
         wanted = max(score.pred_to_gt.p95_m, score.gt_to_pred.p95_m, 1e-6)
         power = 10.0 ** np.floor(np.log10(wanted))
         return cls(float(power * next(s for s in (1, 2, 5, 10) if s * power >= wanted * (1 - 1e-9))), outlier_m)
 
     def colours(self, distance_m: Array) -> Pixels:
-        """(N, 3) red, green, blue for distances (N,)."""
+        """Return (N, 3) red, green, blue for distances (N,)."""
         level = np.clip(255 * distance_m / self.full_m, 0, 255).astype(np.uint8)
         bgr = cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_VIRIDIS).reshape(-1, 3)
         out = np.ascontiguousarray(bgr[:, ::-1]).astype(np.uint8)
@@ -68,13 +68,13 @@ class Panel:
 
     @classmethod
     def of_distances(cls, surface: Surface, compared: DistanceSamples, scale: HeatScale, title: str) -> Panel:
-        """The samples of a surface in the colours of their distances."""
+        """Return the samples of a surface in the colours of their distances."""
         samples = compared.samples
         colours = scale.colours(compared.distance_m)
         return cls(samples.points_m, colours, lambda some: normals_at(surface, samples.origin[some]), title)
 
     def part(self, chosen: IntArray) -> Panel:
-        """Some of its points (K,)."""
+        """Return some of its points (K,)."""
         return Panel(self.points_m[chosen], self.colours[chosen], lambda some: self.normals(chosen[some]), self.title)
 
 
@@ -86,13 +86,13 @@ def heat_picture(
     names: tuple[str, str] = ("prediction", "truth"),
     more: Sequence[Panel] = (),
 ) -> Pixels:
-    """A picture of two surfaces by their distances, seen along one direction.
+    """Draw two surfaces coloured by their distances, seen along one direction.
 
     Args:
         pred, gt: the surfaces.
         score: their distances.
-        scale: of the colours.
-        names: of the two, for the titles.
+        scale: the scale of the colours.
+        names: the names of both surfaces, for the titles.
         more: further views of the same scene, beside them.
 
     Returns:
@@ -149,12 +149,12 @@ def heat_row(panels: Sequence[Panel], gt: Surface, gt_points_m: Array, panel_px:
 
 
 def heat_bar(width: int, scale: HeatScale) -> Pixels:
-    """(H, width, 3) the scale of colours, to be put under a picture."""
+    """Return (H, width, 3) the scale of colours, to be put under a picture."""
     return _bar(width, scale)
 
 
 def _view(surface: Surface, points: Array) -> Array:
-    """(3, 3) rows: right, down, away from the viewer, who looks onto the widest side of the surface."""
+    """Return (3, 3) rows: right, down, away from the viewer, who looks onto the widest side of the surface."""
     few = points[:: max(1, len(points) // 20_000)]
     right, _, flat = np.linalg.svd(few - few.mean(axis=0), full_matrices=False)[2]
     toward = surface.area_vectors_m2.sum(axis=0) if surface.is_mesh else np.zeros(3)
@@ -165,7 +165,7 @@ def _view(surface: Surface, points: Array) -> Array:
 
 
 def _splat(panel: Panel, seen: Array, pixel_m: float, shape: tuple[int, int], away: Array) -> Pixels:
-    """The points of one surface as pixels, the nearest to the viewer on top, without paper between neighbours."""
+    """Draw the points of one surface as pixels, the nearest to the viewer on top, without paper between them."""
     at = (seen[:, :2] / pixel_m).astype(np.int64)
     order = np.argsort(-seen[:, 2])
     nearest_of = np.full(shape, -1, dtype=np.int64)
@@ -199,7 +199,7 @@ def _splat(panel: Panel, seen: Array, pixel_m: float, shape: tuple[int, int], aw
 
 
 def _gap_px(seen: Array, pixel_m: float, occupied: int) -> int:
-    """How far from a point of a surface (N, 3) the middle of a gap between neighbours is, in pixels."""
+    """Return how far from a point of a surface (N, 3) the middle of a gap between neighbours is, in pixels."""
     if len(seen) < 2 or len(seen) > _DENSE * occupied:
         return 1
     some = np.arange(0, len(seen), max(1, len(seen) // _SOME))
@@ -209,7 +209,7 @@ def _gap_px(seen: Array, pixel_m: float, occupied: int) -> int:
 
 
 def _captioned(image: Pixels, title: str) -> Pixels:
-    """The picture with its title above it."""
+    """Return the picture with its title above it."""
     head = np.full((_TEXT_PX, image.shape[1], 3), _PAPER, dtype=np.uint8)
     size = min(0.7, image.shape[1] / 11 / max(len(title), 1))
     cv2.putText(head, title, (4, _TEXT_PX - 10), cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
@@ -217,7 +217,7 @@ def _captioned(image: Pixels, title: str) -> Pixels:
 
 
 def _bar(width: int, scale: HeatScale) -> Pixels:
-    """The scale of colours under the pictures."""
+    """Return the scale of colours under the pictures."""
     out = np.full((2 * _MARGIN_PX + _BAR_PX + _TEXT_PX, width, 3), _PAPER, dtype=np.uint8)
     length = width - 2 * _MARGIN_PX
     colours = scale.colours(np.linspace(0, scale.full_m, length))[:, ::-1]
@@ -241,10 +241,10 @@ def write_heat_mesh(
     """Write a surface with, at each vertex, its distance in millimetres (`distance_mm`) and the colour of that.
 
     Args:
-        path: of the file.
+        path: the file to write.
         surface: metres.
         distance_m: (V,); what lies beyond the limit of the scale may be infinite, and is written as the limit.
-        scale: of the colours.
+        scale: the scale of the colours.
         metres_per_unit: unit of the file's coordinates, so that it lies over the file that was judged.
         comments: further lines for the header, in ASCII.
     """
@@ -260,13 +260,13 @@ _WORDS = {Source.CT: "CT orange", Source.SCAN: "scan blue", Source.BLEND: "blend
 
 
 def fusion_picture(ct: Surface, scan: Surface, score: ChamferScore, scale: HeatScale, fused: Fused) -> bytes:
-    """A PNG with CT and scan by their distances, and the fused mesh by its sources, seen along one direction.
+    """Draw a PNG with CT and scan by their distances, and the fused mesh by its sources, seen along one direction.
 
     Args:
-        ct, scan: as they were compared, in one frame.
-        score: of the comparison.
-        scale: of its colours.
-        fused: of both.
+        ct, scan: the surfaces as they were compared, in one frame.
+        score: the result of the comparison.
+        scale: the scale of its colours.
+        fused: the fusion of both.
     """
     palette = np.array([_COLOURS[source] for source in Source], dtype=np.uint8)
     title = "source: " + ", ".join(f"{_WORDS[s]} {100 * fused.share(s):.0f} %" for s in Source)

@@ -40,12 +40,12 @@ class OverlapLimits:
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """For each vertex of the CT (V,): the nearest place of the scan (V, 3), and whether the scan is good there.
+    """The nearest place of the scan (V, 3) for each vertex of the CT (V,), and whether the scan is good there.
 
     Attributes:
-        nearest_m: (V, 3).
+        nearest_m: (V, 3) nearest places of the scan.
         offset_m: (V,) height of the CT above the scan there, along the CT's outward normal.
-        covered: (V,).
+        covered: (V,) true where the scan is good.
     """
 
     nearest_m: Array = field(repr=False)
@@ -112,13 +112,13 @@ class _FacesAround:
 
 @dataclass(frozen=True, slots=True)
 class WoundLimits:
-    """What counts as a wound.
+    """The limits by which a part of the surface counts as a wound.
 
     Attributes:
         closing_m: uncovered places nearer than twice this to one another are one, with what lies between.
-        least_area_m2: of the surface.
-        least_depth_m: mean depth below the rim.
-        least_facing: mean cosine between its normals and up, so that undersides and sides are none.
+        least_area_m2: least area of its surface.
+        least_depth_m: least mean depth below the rim.
+        least_facing: least mean cosine between its normals and up, so that undersides and sides are none.
     """
 
     closing_m: float = 0.003
@@ -128,7 +128,7 @@ class WoundLimits:
 
 
 def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | None = None) -> Mask:
-    """(V,) vertices of the CT in hollows that open upwards and that the scan lacks; all False if there are none.
+    """Return (V,) vertices of the CT in hollows open upwards that the scan misses; all False if there are none.
 
     Args:
         ct: the CT's mesh.
@@ -160,13 +160,13 @@ def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | N
 
 
 def _size_and_facing(surface: Surface, faces: slice, up: Array) -> Array:
-    """(N, 2) a third of the area of some faces, and of that area as seen from above: each corner's part."""
+    """Return (N, 2) a third of the area of some faces, and of that area as seen from above: each corner's part."""
     vectors = surface.area_vectors_of(faces) / 3
     return np.stack([np.linalg.norm(vectors, axis=1), vectors @ (up / np.linalg.norm(up))], axis=1)
 
 
 def components(surface: Surface, chosen: Mask) -> IntArray:
-    """(V,) number of the connected part that each chosen vertex is in; -1 for the others."""
+    """Return (V,) number of the connected part that each chosen vertex is in; -1 for the others."""
     index = np.full(len(chosen), -1, dtype=np.int32)
     n = int(chosen.sum())
     index[chosen] = np.arange(n)
@@ -181,7 +181,7 @@ def components(surface: Surface, chosen: Mask) -> IntArray:
 
 
 def _spanning(faces: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of vertices (K,), (K,) that connect what these faces (N, 3) connect; there are fewer pairs than edges.
+    """Return pairs of vertices (K,), (K,) that connect what these faces (N, 3) connect, fewer than the edges.
 
     Vertices of number -1 are left out; the others have numbers below n.
     """
@@ -203,7 +203,7 @@ def _spanning(faces: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDAr
 
 
 def rim_vertices(surface: Surface) -> IntArray:
-    """(K,) vertices on edges that only one face has."""
+    """Return (K,) vertices on edges that only one face has."""
     f, n = surface.faces, len(surface.vertices_m)
     ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).astype(np.int64), axis=1)
     keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
@@ -212,7 +212,7 @@ def rim_vertices(surface: Surface) -> IntArray:
 
 
 def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
-    """(N,) distance from each point (N, 3) to the nearest chosen one; infinite if none is nearer than `within_m`."""
+    """Return (N,) distance from points (N, 3) to the nearest chosen one; infinite beyond `within_m`."""
     distance = np.where(chosen, 0.0, np.inf)
     if chosen.any():
         distance[~chosen] = PointIndex(points[chosen]).nearest(points[~chosen], within_m)[0]
@@ -220,7 +220,7 @@ def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
 
 
 def _closed(points: Array, chosen: Mask, radius: float) -> Mask:
-    """Grown and shrunk by a radius, so that gaps and islands between chosen points are chosen, too."""
+    """Grow and shrink a mask by a radius, so that gaps and islands between chosen points are chosen, too."""
     grown = distance_to(points, chosen, radius) <= radius
     return chosen | (distance_to(points, ~grown, radius) > radius)
 
@@ -239,7 +239,7 @@ class Region(Protocol):
     """A part of space."""
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie inside."""
+        """Return (N,) which points (N, 3) lie inside."""
         ...
 
 
@@ -251,7 +251,7 @@ class Box:
     size_m: Array
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie inside or on the faces."""
+        """Return (N,) which points (N, 3) lie inside or on the faces."""
         return np.all(np.abs(apply(inverse(self.T_world_box), points_m)) <= 0.5 * self.size_m, axis=1)
 
 
@@ -268,7 +268,7 @@ class Prism:
             raise DataError("a polygon needs at least three corners (x, y)", remedy="Draw it again")
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie inside; by the parity of the polygon's edges that a line from each crosses."""
+        """Return (N,) which points (N, 3) lie inside, by the parity of the edges that a line from each crosses."""
         p = apply(inverse(self.T_world_plane), points_m)
         inside = np.zeros(len(p), dtype=np.bool_)
         for a, b in zip(self.polygon_m, np.roll(self.polygon_m, -1, axis=0), strict=True):
@@ -287,7 +287,7 @@ class SphereRegion:
     radius_m: float
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie in it."""
+        """Return (N,) which points (N, 3) lie in it."""
         out = np.zeros(len(points_m), dtype=np.bool_)
         for centre in self.centres_m:
             beside = np.flatnonzero(np.abs(points_m[:, 0] - centre[0]) <= 1.001 * self.radius_m)  # few are
@@ -300,9 +300,9 @@ class RegionCorrection:
     """A region in which a person has chosen CT or scan.
 
     Attributes:
-        region: where.
+        region: the region.
         from_ct: True: the CT is taken there; False: the scan, wherever it has surface.
-        by: who drew it.
+        by: the person who drew it.
     """
 
     region: Region
@@ -311,7 +311,7 @@ class RegionCorrection:
 
 
 def corrected(proposed: Mask, points_m: Array, corrections: Sequence[RegionCorrection]) -> Mask:
-    """(N,) the mask after the corrections, of which a later one overrules an earlier one."""
+    """Return (N,) the mask after the corrections, of which a later one overrules an earlier one."""
     out = proposed.copy()
     for correction in corrections:
         out[correction.region.contains(points_m)] = correction.from_ct
@@ -319,12 +319,12 @@ def corrected(proposed: Mask, points_m: Array, corrections: Sequence[RegionCorre
 
 
 def seen_along(corners_m: Array, along: Array, depth_m: tuple[float, float]) -> Prism:
-    """A polygon with corners (K, 3) in space, as seen along a direction (3,), extended along it.
+    """Build the prism over a polygon with corners (K, 3) in space, as seen along a direction (3,), extended along it.
 
     Args:
-        corners_m: in order around the polygon.
-        along: from the surface towards the viewer.
-        depth_m: how far it reaches below the lowest corner (negative) and above the highest one.
+        corners_m: (K, 3) corners in order around the polygon.
+        along: (3,) direction from the surface towards the viewer.
+        depth_m: distances by which it reaches below the lowest corner (negative) and above the highest one.
 
     Raises:
         DataError: fewer than three corners, or no direction.
@@ -338,7 +338,7 @@ def seen_along(corners_m: Array, along: Array, depth_m: tuple[float, float]) -> 
 
 
 def outline(points_m: Array, up: Array) -> Prism:
-    """The smallest convex prism along `up` (3,) that holds these points (N, 3): a polygon to begin drawing with."""
+    """Return the smallest convex prism along `up` (3,) that holds points (N, 3): a polygon to start drawing with."""
     T = _plane(up)
     T[:3, 3] = points_m.mean(axis=0)
     p = apply(inverse(T), points_m)
@@ -347,7 +347,7 @@ def outline(points_m: Array, up: Array) -> Prism:
 
 
 def _plane(direction: Array) -> Transform:
-    """(4, 4) rotation whose z is this direction (3,)."""
+    """Return (4, 4) rotation whose z is this direction (3,)."""
     z = direction / np.linalg.norm(direction)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)

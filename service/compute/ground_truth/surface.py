@@ -27,13 +27,13 @@ class Surface:
 
     @classmethod
     def kept(cls, path: Path) -> Surface:
-        """The mesh of a CT or a scan as an import keeps it: an .npz file of `vertices_m` and `faces`."""
+        """Return the mesh of a CT or a scan as an import keeps it: an .npz file of `vertices_m` and `faces`."""
         with np.load(path, allow_pickle=False) as mesh:
             return cls(mesh["vertices_m"].astype(np.float64, copy=False), mesh["faces"])  # their integers are short
 
     @property
     def is_mesh(self) -> bool:
-        """Whether there are faces."""
+        """True if the surface has faces."""
         return len(self.faces) > 0
 
     @cached_property
@@ -45,17 +45,17 @@ class Surface:
         return out
 
     def blocks(self) -> Iterator[slice]:
-        """The faces in blocks, in order."""
+        """Yield the faces in blocks, in order."""
         for begin in range(0, len(self.faces), FACES):
             yield slice(begin, min(begin + FACES, len(self.faces)))
 
     def touching(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(F,) which faces have one of the chosen (V,) vertices."""
+        """Return (F,) which faces have one of the chosen (V,) vertices."""
         one, other, third = self.faces.T
         return chosen[one] | chosen[other] | chosen[third]
 
     def area_vectors_of(self, chosen: IntArray | slice) -> Array:
-        """(N, 3) `area_vectors_m2` of some faces alone."""
+        """Return (N, 3) `area_vectors_m2` of some faces alone."""
         corners = self.faces[chosen]
         out = np.empty((len(corners), 3))
         for begin in range(0, len(corners), FACES):
@@ -65,7 +65,7 @@ class Surface:
         return out
 
     def normals_of(self, chosen: IntArray | slice) -> Array:
-        """(N, 3) unit normals of some faces; zero for faces without area."""
+        """Return (N, 3) unit normals of some faces; zero for faces without area."""
         vectors = self.area_vectors_of(chosen)
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
@@ -89,7 +89,7 @@ class Surface:
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
     def sums_at_vertices(self, of_faces: Callable[[slice], Array]) -> Array:
-        """(V, K) sums over the faces around each vertex of what a function gives for a block of faces (N, K)."""
+        """Sum (V, K), over the faces around each vertex, what a function gives for a block of faces (N, K)."""
         total: Array | None = None
         for block in self.blocks():
             values = of_faces(block)
@@ -106,7 +106,7 @@ class Surface:
         return float(self.face_areas_m2.sum())
 
     def moved(self, T_a_b: Transform) -> Surface:
-        """This surface, of frame b, in frame a."""
+        """Return this surface, of frame b, in frame a."""
         normals = None if self.normals is None else self.normals @ T_a_b[:3, :3].T
         return Surface(apply(T_a_b, self.vertices_m), self.faces, normals)
 
@@ -128,10 +128,10 @@ def write_ply(
     """Write a surface.
 
     Args:
-        path: of the file.
+        path: the file to write.
         surface: metres.
         metres_per_unit: unit of the file's coordinates.
-        properties: for each name (V,) numbers: fractional ones are written as float, others as unsigned bytes.
+        properties: (V,) numbers for each name: fractional ones are written as float, others as unsigned bytes.
         comments: lines for the header, in ASCII.
     """
     columns = {name: surface.vertices_m[:, k] / metres_per_unit for k, name in enumerate("xyz")}
@@ -144,11 +144,11 @@ def write_ply(
 def ply_bytes(
     columns: Mapping[str, NDArray[np.generic]], faces: NDArray[np.integer], comments: Sequence[str] = ()
 ) -> bytes:
-    """A binary, little-endian PLY.
+    """Encode a binary, little-endian PLY.
 
     Args:
-        columns: for each property of the vertices, x, y and z first, (V,) float32, float64 or uint8.
-        faces: (F, 3).
+        columns: (V,) float32, float64 or uint8 for each property of the vertices, x, y and z first.
+        faces: (F, 3) indices of vertices.
         comments: lines for the header, in ASCII.
     """
     return b"".join(_ply_blocks(columns, faces, comments))
@@ -157,7 +157,7 @@ def ply_bytes(
 def _ply_blocks(
     columns: Mapping[str, NDArray[np.generic]], faces: NDArray[np.integer], comments: Sequence[str]
 ) -> Iterator[bytes]:
-    """The file in blocks."""
+    """Yield the file in blocks."""
     kinds = {name: values.dtype.newbyteorder("<").str for name, values in columns.items()}
     vertices = len(columns["x"])
     lines = [
@@ -183,7 +183,7 @@ def _ply_blocks(
 
 
 def read_ply(path: Path) -> tuple[dict[str, NDArray[np.generic]], IntArray]:
-    """The properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
+    """Read the properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
 
     Raises:
         DataError: another program wrote the file, or its end is missing.

@@ -70,17 +70,17 @@ class HandEyeAnswer:
         T_base_board: the board's pose.
         sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
         sigma_deg: bootstrap standard deviation of the rotation.
-        covariance: (6, 6) of T_flange_camera from the bootstrap, (d in metres, w in radians) in the flange's axes,
-            including `camera_share`.
+        covariance: (6, 6) covariance of T_flange_camera from the bootstrap, (d in metres, w in radians) in the
+            flange's axes, including `camera_share`.
         camera_share: (6, 6) part of it due to the camera calibration's uncertainty, which more images do not reduce.
         formal_covariance: (6, 6) predicted by the fit's own noise model; None unless the method is weighted.
         robot_noise_mm: standard deviation per axis of the robot's remaining position error; None unless the method is
             weighted.
-        robot_noise_deg: the same for its rotation.
+        robot_noise_deg: standard deviation of its orientation error; None unless the method is weighted.
         residual_mm: (N,) distance between the board as placed by each view and T_base_board, at the board's middle.
-        residual_deg: (N,) the same for its orientation.
-        held_out_mm: (N,) as residual_mm, but each view is judged by a calibration without its fold.
-        held_out_deg: (N,) the same for its orientation.
+        residual_deg: (N,) angle between the two.
+        held_out_mm: (N,) distance like residual_mm, but each view is judged by a calibration without its fold.
+        held_out_deg: (N,) angle like residual_deg, judged in the same way.
     """
 
     T_flange_camera: Transform
@@ -104,8 +104,8 @@ class CorrectedHandEye(HandEyeAnswer):
 
     Attributes:
         correction: the arm's systematic error.
-        terms: which of its parameters were estimated.
-        size: of the board, by the lengths of the corrected arm.
+        terms: the parameters that were estimated.
+        size: the board's size by the lengths of the corrected arm.
     """
 
     correction: ArmCorrection
@@ -122,19 +122,19 @@ class HandEyeResult(HandEyeAnswer):
         methods: T_flange_camera by every method that gave an answer.
         spread_mm: largest distance between the chosen method's translation and another's (including Tsai's and
             Andreff's, which are the weakest: a large spread warns of weak data).
-        spread_deg: the same for the rotation.
+        spread_deg: largest angle between the chosen method's rotation and another's.
         corner_sigma_px: standard deviation of the corners; None if only board poses were given.
         rotation_spread_deg: largest rotation between two views.
         second_axis_deg: root mean square rotation about the second best axis.
         condition: condition number of the translation's linear system; infinite for a single rotation axis.
-        turned: (N,) whether the view's board pose was rotated by half a turn.
+        turned: (N,) true if the view's board pose was rotated by half a turn.
         excluded: reason by index of each view that no fit used.
         corrected: the answer with the arm's systematic error estimated; None if no joints were given or if it does
             not lower the held-out error.
         arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
             reported).
-        size: of the board, by the robot's lengths.
-        findings: what the measurements contradict, in words; empty if nothing.
+        size: the board's size by the robot's lengths.
+        findings: texts of what the measurements contradict; empty if nothing.
     """
 
     method: Method
@@ -164,13 +164,13 @@ class HandEyeViews:
     """N views of a board, as measured.
 
     Attributes:
-        T_base_flange: (N, 4, 4) from the robot.
-        T_camera_board: (N, 4, 4) from the images.
+        T_base_flange: (N, 4, 4) flange poses by the robot.
+        T_camera_board: (N, 4, 4) board poses by the images.
         corners: the boards' corners, from which the board poses' covariance follows; required by `reprojection`.
-        joints_rad: (N, J) as recorded with the poses.
+        joints_rad: (N, J) joints as recorded with the poses.
         arm: the arm's model, with `joints_rad`.
-        board: as described, with the tolerance of its size; None: its size is exactly known.
-        poses: how else the file of the robot's poses could be read; None if they come from the robot itself.
+        board: the board as described, with the tolerance of its size; None: its size is exactly known.
+        poses: the other ways to read the file of the robot's poses; None if they come from the robot itself.
     """
 
     T_base_flange: Array
@@ -206,15 +206,15 @@ def calibrate_hand_eye(
         setup: eye-to-hand: the camera stands beside the robot and the board is on the flange. T_base_camera and
             T_flange_board then take the places of T_flange_camera and T_base_board in the answer, and the arm's
             systematic error is not estimated.
-        camera_covariance: of the calibrated camera; with corners, it is added to the answer's covariance.
+        camera_covariance: covariance of the calibrated camera; with corners, it is added to the answer's covariance.
         bootstrap: number of resamples.
-        seed: of the resampling and of the folds.
+        seed: seed of the resampling and of the folds.
 
     Raises:
         DataError: array shapes do not match, values are not finite, or the joints are another arm's.
         ComputeError: too few views, too little rotation, rotation about one axis only, poses that do not fit the
             images (`check_setup` names the reading that does), more than a third of the images disagree with the
-            robot, or the board's size differs from the stated one by more than its tolerance and the uncertainty.
+            robot, or the board's size differs from the given one by more than its tolerance and the uncertainty.
     """
     data, poses = _measured(views), views.poses
     if setup == "eye-to-hand":
@@ -296,7 +296,7 @@ def _agreed(
     sized: Callable[[HandEyeSolution, float], BoardSizeFound],
     rng: np.random.Generator,
 ) -> _Agreed:
-    """The views on which robot and images agree; `check` refuses poses that do not belong together."""
+    """Return the views on which robot and images agree; `check` refuses poses that do not belong together."""
 
     def solved(turned: NDArray[np.bool_]) -> _Agreed:
         straight, sigma_px = _straightened(data, turned, T_board_turned)
@@ -305,7 +305,7 @@ def _agreed(
         keep = ~np.isin(np.arange(len(turned)), list(excluded))
         good = straight.take(keep)
         free = without_size(good)
-        sized(free, free.scale)  # before a fit that believes the stated size hides the difference in its noise
+        sized(free, free.scale)  # before a fit that believes the given size hides the difference in its noise
         weighted = fit_method(good, "weighted")
         answer = weighted if method == "weighted" else fit_resized(good, method, weighted, weighted.scale)
         return _Agreed(straight, turned, sigma_px, excluded, answer, weighted, free)
@@ -320,13 +320,13 @@ def _agreed(
 
 
 def _folds(n: int, seed: int) -> NDArray[np.int64]:
-    """(n,) fold of each view."""
+    """Return (n,) fold of each view."""
     count = min(_FOLDS if n > _FEW else 2 * _FOLDS, n)
     return np.random.default_rng(seed).permutation(n) % count
 
 
 def _outcomes(agreed: _Agreed, method: Method, folds: NDArray[np.int64], point: Array) -> dict[ArmTerms, _Outcome]:
-    """The answer without the arm's errors, and with each model of them that the views allow."""
+    """Return the answer without the arm's errors, and with each model of them that the views allow."""
     data, keep, plain = agreed.data, agreed.keep, agreed.plain
     outcomes: dict[ArmTerms, _Outcome] = {
         "none": _Outcome(plain, *held_out(data, keep, method, "none", (plain, None), folds, point))
@@ -343,7 +343,7 @@ def _outcomes(agreed: _Agreed, method: Method, folds: NDArray[np.int64], point: 
 def _corrected(
     outcomes: dict[ArmTerms, _Outcome], rms_mm: dict[ArmTerms, float], quality: Callable[[_Outcome], dict[str, Any]]
 ) -> CorrectedHandEye | None:
-    """The answer with the arm's errors that held-out views support best; None if they do not improve."""
+    """Return the answer with the arm's errors that held-out views support best; None if they do not improve."""
     best = min(rms_mm, key=lambda terms: rms_mm[terms])
     correction = outcomes[best].answer.correction
     if correction is None or rms_mm[best] >= _WORTH * rms_mm["none"]:
@@ -352,7 +352,7 @@ def _corrected(
 
 
 def _bootstrap(good: HandEyeMeasurements, method: Method, count: int, seed: int, outcome: _Outcome) -> Array:
-    """(6, 6) covariance of T_flange_camera by resampling the views."""
+    """Return (6, 6) covariance of T_flange_camera by resampling the views."""
     covariance = bootstrap_covariance(good, method, outcome.answer, count, np.random.default_rng(seed))
     if method in CLOSED_FORMS:
         return not_below_held_out(covariance, outcome.held_out_mm, outcome.held_out_deg)
@@ -365,12 +365,12 @@ def _with_size(
     quality: Callable[[BoardSizeFound, _Outcome], dict[str, Any]],
     outcome: _Outcome,
 ) -> dict[str, Any]:
-    """`quality` of an answer with the arm's errors, which shows the board's size better than one without them."""
+    """Return `quality` of an answer with the arm's errors, which shows the board's size best."""
     return quality(sized(without_size(good, outcome.answer), outcome.answer.scale), outcome)
 
 
 def _sized(board: Board | None, count: int, seed: int, free: HandEyeSolution, used: float) -> BoardSizeFound:
-    """The board's size by the robot (`size_found`). Raises ComputeError if it is not credible."""
+    """Return the board's size by the robot (`size_found`). Raises ComputeError if it is not credible."""
     assert free.views is not None
     n = len(free.views.T_base_flange)
     counts = bootstrap_counts(bootstrap_picks(n, count, np.random.default_rng(seed)), n)
@@ -387,7 +387,7 @@ def _quality(
     size: BoardSizeFound,
     outcome: _Outcome,
 ) -> dict[str, Any]:
-    """The fields of a HandEyeAnswer."""
+    """Return the fields of a HandEyeAnswer."""
     answer = outcome.answer
     residual = deviation(data.placed(answer), answer.T_base_board, point_m)
     covariance = resampled(outcome) + share
@@ -410,7 +410,7 @@ def _quality(
 
 
 def _measured(views: HandEyeViews) -> HandEyeMeasurements:
-    """The views as arrays whose shapes agree."""
+    """Return the views as arrays whose shapes agree."""
     corners = views.corners
     hands = np.asarray(views.T_base_flange, dtype=np.float64)
     boards = np.asarray(views.T_camera_board, dtype=np.float64)
@@ -432,7 +432,7 @@ def _measured(views: HandEyeViews) -> HandEyeMeasurements:
 def _straightened(
     data: HandEyeMeasurements, turned: NDArray[np.bool_], T_board_turned: Transform | None
 ) -> tuple[HandEyeMeasurements, float | None]:
-    """The views with half-turned boards turned back, their corners renumbered, and the boards' covariance."""
+    """Return the views with half-turned boards turned back, their corners renumbered, and the boards' covariance."""
     boards, corners = data.boards, data.corners
     if T_board_turned is not None:
         boards = np.where(turned[:, None, None], boards @ T_board_turned, boards)
@@ -447,7 +447,7 @@ def _straightened(
 def _arm_answer(
     data: HandEyeMeasurements, keep: NDArray[np.bool_], plain: HandEyeSolution, terms: ArmTerms, noise: Noise
 ) -> tuple[HandEyeSolution, NDArray[np.bool_], Noise]:
-    """The fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
+    """Return the fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
     good = data.take(keep)
     answer = fit_with_arm(good, plain, terms, noise)
     wrong = arm_outliers(answer)
@@ -461,7 +461,7 @@ def _arm_answer(
 
 
 def _methods(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> dict[Method, Transform]:
-    """T_flange_camera by every method that has an answer."""
+    """Return T_flange_camera by every method that has an answer."""
     answers: dict[Method, Transform] = {method: answer.T_flange_camera}
     resized = data.resized(answer.scale)
     for name, T in all_closed_forms(resized.hands, resized.boards).items():

@@ -60,7 +60,7 @@ _MAX_EXCLUDED = 1 / 3
 _ARM_FLOOR_M = 3e-6  # no arm is more repeatable
 _MIN_ARM_VIEWS = 9
 _ROUNDS = 6
-_DERIVATIVES = 2  # how often the arm's derivative is taken anew; after two, a micrometre is left
+_DERIVATIVES = 2  # how often the arm's derivative is taken again; after two, a micrometre is left
 ANY_SIZE = 1.0  # relative standard deviation of a board's size of which nothing is known
 
 
@@ -71,12 +71,12 @@ class HandEyeSolution:
     Attributes:
         T_flange_camera: the calibration.
         T_base_board: the board's pose.
-        scale: of the board, its true size over the stated one.
+        scale: the board's true size over the given one.
         scale_sigma: standard deviation of `scale`, by the noise model.
         views: the views with the arm parameters in use; weighted fit only.
         noise: weighted fit only.
         fit: weighted fit only.
-        correction: of the arm, if it was estimated.
+        correction: the arm's correction, if it was estimated.
     """
 
     T_flange_camera: Transform
@@ -93,7 +93,7 @@ class HandEyeSolution:
 class HandEyeMeasurements:
     """All measurements of N views; `corners` and `joints_rad` (N, J) if known.
 
-    `size_sigma` is the relative standard deviation of the board's stated size.
+    `size_sigma` is the relative standard deviation of the board's given size.
     """
 
     hands: Array
@@ -117,19 +117,19 @@ class HandEyeMeasurements:
         )
 
     def resized(self, scale: float) -> HandEyeMeasurements:
-        """The measurements for a board that is `scale` times as large."""
+        """Return the measurements for a board that is `scale` times as large."""
         corners = self.corners
         if corners is not None:
             corners = BoardCorners(scale * corners.points_m, corners.corners_px, corners.camera)
         return dataclasses.replace(self, boards=scaled(self.boards, scale), corners=corners)
 
     def views(self) -> BoardViews:
-        """The views for a weighted fit without parameters of the arm."""
+        """Return the views for a weighted fit without parameters of the arm."""
         kind, design = np.zeros(0, dtype=np.int64), np.zeros((len(self.hands), 6, 0))
         return BoardViews(self.hands, self.boards, self.covariance, design, kind, np.zeros(0), self.size_sigma)
 
     def arm_views(self, terms: ArmTerms, about: Array | None = None) -> BoardViews:
-        """The views for a weighted fit with these parameters (K,) of the arm, near `about`; None: near zero.
+        """Return the views for a weighted fit with these parameters (K,) of the arm, near `about`; None: near zero.
 
         Raises:
             DataError: the joints are another arm's.
@@ -146,7 +146,7 @@ class HandEyeMeasurements:
         return BoardViews(hands, self.boards, self.covariance, design, kind, about, self.size_sigma, known)
 
     def placed(self, answer: HandEyeSolution) -> Array:
-        """(N, 4, 4) T_base_board from each view alone."""
+        """Return (N, 4, 4) T_base_board from each view alone."""
         hands = self.hands
         if answer.correction is not None:
             assert self.joints_rad is not None
@@ -155,7 +155,7 @@ class HandEyeMeasurements:
 
 
 def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[int, str]:
-    """Views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
+    """Find the views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
 
     Raises:
         ComputeError: more than a third of the views disagree.
@@ -194,7 +194,7 @@ def _answer_of(fit: Fit) -> HandEyeSolution:
 
 
 def _noise_at(data: HandEyeMeasurements, fit: Fit) -> Noise:
-    """A robust initial estimate of the noise from the increments near an answer."""
+    """Return a robust initial estimate of the noise from the increments near an answer."""
     e, _, _ = linearise(data.hands, scaled(data.boards, fit.scale), fit.T_flange_camera, fit.T_base_board)
     lengths = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
     robot_m, robot_rad = (max(float(v) / _MEDIAN_NORM, FLOOR_M) for v in np.median(lengths, axis=0))
@@ -202,7 +202,7 @@ def _noise_at(data: HandEyeMeasurements, fit: Fit) -> Noise:
 
 
 def turned_back(data: HandEyeMeasurements, answer: HandEyeSolution, T_board_turned: Transform) -> NDArray[np.bool_]:
-    """(N,) views that fit the answer better with the board turned by half a turn."""
+    """Return (N,) views that fit the answer better with the board turned by half a turn."""
     apart = [
         dataclasses.replace(data, boards=boards, corners=None).placed(answer)
         for boards in (data.boards, data.boards @ T_board_turned)
@@ -212,10 +212,10 @@ def turned_back(data: HandEyeMeasurements, answer: HandEyeSolution, T_board_turn
 
 
 def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution | None = None) -> HandEyeSolution:
-    """One method's answer from these views, without a model of the arm's error.
+    """Solve these views with one method, without a model of the arm's error.
 
     Args:
-        data: without outliers.
+        data: the measurements without outliers.
         method: the method.
         start: a nearby answer, which saves the search for a start.
 
@@ -227,9 +227,9 @@ def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution
 
 
 def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution, scale: float) -> HandEyeSolution:
-    """An unweighted method's answer for a board that is `scale` times as large as stated.
+    """Solve with an unweighted method for a board that is `scale` times as large as given.
 
-    These methods have no noise by which the stated size could be weighed against the views: the weighted fit tells
+    These methods have no noise by which the given size could be weighed against the views: the weighted fit gives
     them the scale.
 
     Raises:
@@ -247,11 +247,11 @@ def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution
 
 
 def without_size(data: HandEyeMeasurements, answer: HandEyeSolution | None = None) -> HandEyeSolution:
-    """The weighted fit's answer if nothing were known of the board's size.
+    """Return the weighted fit's answer if nothing were known of the board's size.
 
     Args:
-        data: without outliers.
-        answer: with the arm's errors, whose noise is then kept; None: without them.
+        data: the measurements without outliers.
+        answer: an answer with the arm's errors, whose noise is then used; None: without them.
 
     Raises:
         ComputeError: the views do not determine the answer.
@@ -275,7 +275,7 @@ def _fit_weighted(data: HandEyeMeasurements, start: HandEyeSolution | None) -> H
 
 
 def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms) -> Noise:
-    """Noise of the model with these arm parameters, before any selection among them.
+    """Return the noise of the model with these arm parameters, before any selection among them.
 
     Raises:
         DataError: the joints are another arm's.
@@ -293,7 +293,7 @@ def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms
 def _settled(
     data: HandEyeMeasurements, terms: ArmTerms, kind: NDArray[np.int64], noise: Noise, near: Fit
 ) -> tuple[BoardViews, Fit]:
-    """The fit with the arm's parameters, and the views with the derivative taken there."""
+    """Return the fit with the arm's parameters, and the views with the derivative taken there."""
     views = dataclasses.replace(data.arm_views(terms), kind=kind)
     fit = solve(views, noise, near)
     for _ in range(_DERIVATIVES):
@@ -307,10 +307,10 @@ def _near(answer: HandEyeSolution | RobustStart) -> Fit:
 
 
 def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms, start: Noise) -> HandEyeSolution:
-    """The weighted answer with the arm's systematic error estimated.
+    """Return the weighted answer with the arm's systematic error estimated.
 
     Args:
-        data: without outliers, with joints and arm.
+        data: the measurements without outliers, with joints and arm.
         plain: the weighted answer without it.
         terms: the arm parameters to estimate.
         start: noise from `arm_noise`, of these views or nearly the same.
@@ -331,7 +331,7 @@ def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTe
 
 
 def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
-    """(P,) 0 for a length of the geometry, 1 for a twist, 2 for the zero of a joint, 3 for one of the gears."""
+    """Return (P,) 0 for a length of the geometry, 1 for a twist, 2 for the zero of a joint, 3 for a gear."""
     geometry = np.concatenate([np.tile([0, 0, 1, 2], arm.axes), np.ones(len(arm.parallel))]).astype(np.int64)
     if terms == "geometry":
         return geometry
@@ -339,14 +339,14 @@ def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
 
 
 def _groups(arm: ArmModel) -> NDArray[np.int64]:
-    """(P,) group of each parameter: its kind for the geometry, then one for each harmonic of each joint."""
+    """Return (P,) group of each parameter: its kind for the geometry, then one for each harmonic of each joint."""
     joints, waves = np.arange(arm.axes)[:, None, None], np.arange(arm.tolerances.harmonics)
     gears = np.broadcast_to(GEOMETRY_KINDS + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
     return np.concatenate([_kinds(arm, "geometry"), gears.ravel()])
 
 
 def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
-    """(J,) share of the prior variance that the data removed, joint by joint."""
+    """Return (J,) share of the prior variance that the data removed, joint by joint."""
     prior = np.array(noise.scales)[kind] ** 2
     left = np.diag(fit.covariance)[-len(kind) :]
     joints = np.arange(arm.axes)
@@ -355,7 +355,7 @@ def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) ->
 
 
 def arm_outliers(answer: HandEyeSolution) -> NDArray[np.bool_]:
-    """(N,) views that a fit with the arm's errors does not explain, though a fit without them may."""
+    """Return (N,) views that a fit with the arm's errors does not explain, though a fit without them may."""
     assert answer.views is not None
     assert answer.noise is not None
     assert answer.fit is not None
@@ -364,7 +364,7 @@ def arm_outliers(answer: HandEyeSolution) -> NDArray[np.bool_]:
 
 
 def arm_is_possible(data: HandEyeMeasurements) -> bool:
-    """Whether joints are known and there are enough views to estimate the arm's errors."""
+    """Return whether joints are known and there are enough views to estimate the arm's errors."""
     return data.arm is not None and data.joints_rad is not None and len(data.hands) >= _MIN_ARM_VIEWS
 
 
@@ -377,12 +377,12 @@ def held_out(
     folds: NDArray[np.int64],
     point_m: Array,
 ) -> tuple[Array, Array]:
-    """(N,) distance in mm and angle in degrees of each view's board from a fit without this view.
+    """Return (N,) distance in mm and angle in degrees of each view's board from a fit without this view.
 
     Args:
         data: all views, including outliers (which no fit uses).
         keep: (N,) whether a view is not an outlier.
-        method: of the fits.
+        method: the method of the fits.
         terms: arm parameters in the fits.
         start: the answer from all views without the arm's errors, and the noise with them, to start from.
         folds: (N,) fold of each view.

@@ -24,9 +24,9 @@ class BoardCorners:
     """Detected corners of N board views.
 
     Attributes:
-        points_m: (P, 3) in the board frame.
+        points_m: (P, 3) points in the board frame.
         corners_px: (N, P, 2) detected; NaN for corners that were not seen.
-        camera: calibrated.
+        camera: the calibrated camera.
     """
 
     points_m: Array
@@ -43,7 +43,7 @@ class BoardCorners:
 
 
 def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel) -> BoardCorners:
-    """The corners of a board's views, which may be partial, as one array."""
+    """Return the corners of a board's views, which may be partial, as one array."""
     points = board.points()
     pixels = np.full((len(views), len(points), 2), np.nan)
     for row, view in zip(pixels, views, strict=True):
@@ -52,7 +52,7 @@ def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel)
 
 
 def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Pixels (N, P, 2) and their derivative (N, P, 2, 6) by the (d, w) increment of each T_camera_board (N, 4, 4)."""
+    """Return pixels (N, P, 2) and derivatives (N, P, 2, 6) by the increment (d, w) of T_camera_board (N, 4, 4)."""
     points = np.einsum("nij,pj->npi", T_camera_board[:, :3, :3], points_m) + T_camera_board[:, None, :3, 3]
     shape = points.shape[:2]
 
@@ -70,7 +70,7 @@ def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraMo
 
 
 def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Array, float]:
-    """(N, 6, 6) covariance of each board pose, and the standard deviation of the corners in px that it follows from.
+    """Return (N, 6, 6) covariance of each board pose, and the corners' standard deviation in px behind it.
 
     The latter is the median over the views of their residuals' standard deviation per axis.
     """
@@ -88,7 +88,7 @@ def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Arra
 
 
 def _grams(hands: Array, corners: BoardCorners, X: Transform, B: Transform) -> Array:
-    """(N, 13, 13) Gram matrices of each view's rows [J | residual]."""
+    """Return (N, 13, 13) Gram matrices of each view's rows [J | residual]."""
     boards = np.array([inverse(hand @ X) @ B for hand in hands])
     pixels, J = projection_jacobian(corners.points_m, boards, corners.camera)
     _, to_flange, from_board = linearise(hands, boards, X, B)
@@ -113,13 +113,13 @@ def _step(gram: Array) -> Array:
 def solve_reprojection(
     hands: Array, corners: BoardCorners, X: Transform, B: Transform
 ) -> tuple[Transform, Transform]:
-    """T_flange_camera and T_base_board of least reprojection error, with the robot's poses fixed.
+    """Minimise the reprojection error over T_flange_camera and T_base_board, with the robot's poses fixed.
 
     The paper's method, by Gauss–Newton. It attributes the robot's errors, which are many times larger, to the images.
 
     Args:
         hands: (N, 4, 4) T_base_flange.
-        corners: of the N views.
+        corners: the board's corners in the N views.
         X: initial T_flange_camera.
         B: initial T_base_board.
 
@@ -161,6 +161,6 @@ def _settles(here: _Iterate, there: _Iterate) -> bool:
 
 
 def resample_reprojection(hands: Array, corners: BoardCorners, X: Transform, B: Transform, counts: Array) -> Array:
-    """(R, 12) increments of the answer if view i counts `counts[r, i]` times."""
+    """Return (R, 12) increments of the answer if view i counts `counts[r, i]` times."""
     flat = counts @ _grams(hands, corners, X, B).reshape(len(hands), -1)
     return np.array([_step(row.reshape(13, 13)) for row in flat])

@@ -30,12 +30,12 @@ _MIN_ROTATION_DEG = 15.0  # largest rotation between two views
 _MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
 _SUBSETS, _SUBSET_SIZE = 24, 8
 _SPOILT = 2.0  # times larger median deviation: leaving the worst quarter out has not helped
-_FAR_BETTER = 3.0  # times smaller misfit without the stated size
-_USUAL_NOISE_M = 1e-3  # of an arm, to weigh the stated size of the board against the views
+_FAR_BETTER = 3.0  # times smaller misfit without the given size
+_USUAL_NOISE_M = 1e-3  # of an arm, to weigh the given size of the board against the views
 
 
 def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transform:
-    """T_flange_camera from poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
+    """Return T_flange_camera from poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
 
     Source: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989, Horaud and Dornaika 1995, Andreff et al. 1999,
     as OpenCV implements them.
@@ -60,7 +60,7 @@ def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transf
 
 
 def all_closed_forms(hands: Array, boards: Array) -> dict[ClosedForm, Transform]:
-    """T_flange_camera by every method that gives an answer."""
+    """Return T_flange_camera by every method that gives an answer."""
     answers: dict[ClosedForm, Transform] = {}
     for method in CLOSED_FORMS:
         try:
@@ -71,7 +71,7 @@ def all_closed_forms(hands: Array, boards: Array) -> dict[ClosedForm, Transform]
 
 
 def observability(hands: Array) -> tuple[float, float, float]:
-    """Largest relative rotation and RMS rotation about the second best axis (degrees), and the condition number.
+    """Return largest relative rotation and RMS rotation about the second axis (degrees), and the condition number.
 
     Raises:
         ComputeError: these rotations do not determine the translation.
@@ -107,7 +107,7 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
     """Correct the views whose board corners were numbered from the other end, so that all views agree with the robot.
 
     Between two views, flange and camera must rotate by the same angle. Which orientation fits each pair better gives
-    a signed graph; its leading eigenvector splits the views into two groups, and the larger one is kept as it is.
+    a signed graph; its leading eigenvector splits the views into two groups, and the larger one stays as it is.
     """
     n = len(hands)
     turned = boards @ T_board_turned
@@ -125,28 +125,28 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
 
 @dataclass(frozen=True, slots=True)
 class RobustStart:
-    """T_flange_camera, T_base_board and the board's scale (true size over the stated one)."""
+    """T_flange_camera, T_base_board and the board's scale (true size over the given one)."""
 
     T_flange_camera: Transform
     T_base_board: Transform
     scale: float
 
     def placed(self, hands: Array, boards: Array) -> Array:
-        """(N, 4, 4) T_base_board from each view alone."""
+        """Return (N, 4, 4) T_base_board from each view alone."""
         return hands @ self.T_flange_camera @ scaled(boards, self.scale)
 
 
 def scaled(boards: Array, scale: float) -> Array:
-    """Board poses (N, 4, 4) in the images of a board that is `scale` times as large as they were computed for."""
+    """Return board poses (N, 4, 4) as if the board were `scale` times as large as they were computed for."""
     out = boards.copy()
     out[:, :3, 3] *= scale
     return out
 
 
 def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
-    """Park's rotation, which no scale changes, and the positions with the board's scale by linear least squares.
+    """Return Park's rotation, which no scale changes, and positions with the board's scale by linear least squares.
 
-    The stated size counts as one measurement with an error of 100 %, so that views that do not determine the scale
+    The given size counts as one measurement with an error of 100 %, so that views that do not determine the scale
     leave it where it is; if the views fit far better without it, as with lengths in another unit, it does not count.
     """
     R = solve_closed_form(hands, boards, "park")[:3, :3]
@@ -167,7 +167,7 @@ def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
 
 
 def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> RobustStart:
-    """The answer of the subset of views that fits half of all views best.
+    """Return the answer of the subset of views that fits half of all views best.
 
     Least median of squares over random subsets (Rousseeuw 1984) and all views, so that a few wrong poses have no
     influence.
@@ -202,12 +202,12 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> Robus
 
 
 def mean_pose(poses: Array) -> Transform:
-    """Mean position and mean rotation of poses (N, 4, 4)."""
+    """Return the mean position and mean rotation of poses (N, 4, 4)."""
     return transform(Rotation.from_matrix(poses[:, :3, :3]).mean(), poses[:, :3, 3].mean(axis=0))
 
 
 def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tuple[Array, Array]:
-    """Distance in mm (of the origin, or of a point (3,) in the poses' frame) and angle in degrees from `mean`."""
+    """Return distance in mm (of the origin, or a point (3,) in the poses' frame) and angle in degrees from `mean`."""
     offset = inverse(mean) @ poses
     angle = Rotation.from_matrix(offset[:, :3, :3]).magnitude()
     point = np.zeros(3) if point_m is None else point_m
@@ -216,7 +216,7 @@ def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tu
 
 
 def distance(a: Transform, b: Transform) -> tuple[float, float]:
-    """Distance in mm and angle in degrees between two poses."""
+    """Return the distance in mm and angle in degrees between two poses."""
     offset = inverse(a) @ b
     return mm(float(np.linalg.norm(offset[:3, 3]))), deg(rotation_angle_rad(offset))
 
@@ -250,8 +250,8 @@ class PoseReading:
 
     Attributes:
         hands: (N, 4, 4) T_base_flange of the views.
-        words: what the poses are then, after "they fit".
-        remedy: what to do.
+        words: text that says which poses they are then, after "they fit".
+        remedy: the advice to the user.
     """
 
     hands: Array
@@ -264,10 +264,10 @@ class PosesAsRead:
     """The robot's poses in the file from which they were read.
 
     Attributes:
-        hands: (M, 4, 4) of all rows in the file's order, as they were read.
+        hands: (M, 4, 4) poses of all rows in the file's order, as they were read.
         rows: (N,) the row of each view.
         images: (N) their names.
-        readings: how else the file could be read.
+        readings: the other ways to read the file.
     """
 
     hands: Array
@@ -276,7 +276,7 @@ class PosesAsRead:
     readings: tuple[PoseReading, ...] = ()
 
     def inverted(self) -> PosesAsRead:
-        """The same with every pose inverted."""
+        """Return the same with every pose inverted."""
         readings = tuple(replace(reading, hands=inverted(reading.hands)) for reading in self.readings)
         return replace(self, hands=inverted(self.hands), readings=readings)
 
@@ -285,7 +285,7 @@ class PosesAsRead:
 class SetupFit:
     """Agreement of the views under one reading of the poses: medians over the views, and the board's relative size.
 
-    `mm` is a length on the board as it was stated, so that it does not depend on the unit of the robot's positions.
+    `mm` is a length on the board as it is described, so that it does not depend on the unit of the robot's positions.
     """
 
     mm: float
@@ -294,11 +294,11 @@ class SetupFit:
 
     @property
     def fits(self) -> bool:
-        """Whether the errors are small enough for a robot."""
+        """True if the errors are small enough for a robot."""
         return self.mm <= _MOST_MM and self.deg <= _MOST_DEG
 
     def beats(self, other: SetupFit) -> bool:
-        """Whether it fits, and so much better that the other reading must be a mistake."""
+        """Return whether it fits, and so much better that the other reading must be a mistake."""
         return self.fits and _CLEARLY * self.mm < other.mm and _CLEARLY * self.deg < other.deg
 
     @property
@@ -314,7 +314,7 @@ class SetupFit:
 
 
 def inverted(poses: Array) -> Array:
-    """(N, 4, 4) inverses of poses (N, 4, 4)."""
+    """Return (N, 4, 4) inverses of poses (N, 4, 4)."""
     return np.array([inverse(T) for T in poses])
 
 
@@ -366,7 +366,7 @@ def _misread(as_read: SetupFit, found: SetupFit, words: str, remedy: str) -> Com
 
 
 def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: bool) -> Iterator[PoseReading]:
-    """Other ways to read the poses, the likeliest first; without `every` only that which may fit like the first."""
+    """Yield other ways to read the poses, likeliest first; without `every` only that which may fit like the first."""
     other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     where = (
         "beside the robot, the board on its flange" if other == "eye-to-hand" else "on the flange, the board still"
@@ -381,7 +381,7 @@ def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: b
 
 
 def _lost_row(hands: Array, boards: Array, point_m: Array, poses: PosesAsRead | None) -> str | None:
-    """How the poses fit if a row was lost, or there twice: from one view on, each has its neighbour's pose."""
+    """Return how the poses fit if a row was lost, or there twice: from one view on, each has its neighbour's pose."""
     if len(hands) < MIN_VIEWS + _LOST_FEWEST:
         return None
     every, rows = (hands, np.arange(len(hands))) if poses is None else (poses.hands, poses.rows)
@@ -401,7 +401,7 @@ def _lost_row(hands: Array, boards: Array, point_m: Array, poses: PosesAsRead | 
 
 
 def _answers_of_a_half(hands: Array, moved: Array, boards: Array) -> Iterator[RobustStart]:
-    """Answers of the first views with their own poses, and of the last ones with their neighbours'.
+    """Yield answers of the first views with their own poses, and of the last ones with their neighbours'.
 
     The row is lost in one half, so one of the two halves has no wrong pose.
     """
@@ -414,7 +414,7 @@ def _answers_of_a_half(hands: Array, moved: Array, boards: Array) -> Iterator[Ro
 
 
 def _split(own: NDArray[np.bool_], neighbours: NDArray[np.bool_]) -> tuple[int, int]:
-    """Number of views that fit at most if the first ones have their own poses and the others their neighbours'.
+    """Count the views that fit at most if the first have their own poses and the others their neighbours'.
 
     Also the index of the first of the others.
     """
@@ -430,7 +430,7 @@ def _ordinal(number: int) -> str:
 
 
 def _near(common: RobustStart, hands: Array, boards: Array, point_m: Array) -> NDArray[np.bool_]:
-    """(N,) whether each view places the board where the common answer does."""
+    """Return (N,) whether each view places the board where the common answer does."""
     mm, deg = deviation(common.placed(hands, boards), common.T_base_board, point_m)
     return (mm <= _MOST_MM / 2) & (deg <= _MOST_DEG / 2)
 

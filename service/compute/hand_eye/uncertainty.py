@@ -26,7 +26,7 @@ _MIN_DISTINCT = 4  # distinct views in a bootstrap replicate
 def bootstrap_covariance(
     data: HandEyeMeasurements, method: Method, answer: HandEyeSolution, count: int, rng: np.random.Generator
 ) -> Array:
-    """(6, 6) covariance of T_flange_camera from resampling whole images.
+    """Return (6, 6) covariance of T_flange_camera from resampling whole images.
 
     It also covers systematic errors, as far as they differ from pose to pose.
     """
@@ -50,31 +50,31 @@ def bootstrap_covariance(
 
 
 def bootstrap_picks(n: int, count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Up to `count` draws of n views with replacement; draws of too few different views are left out."""
+    """Draw up to `count` times n views with replacement; draws of too few different views are left out."""
     picks = [rng.integers(0, n, n) for _ in range(count)]
     return [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
 
 
 def bootstrap_counts(picks: Sequence[NDArray[np.int64]], n: int) -> Array:
-    """(R, n) how often each view counts in each draw."""
+    """Return (R, n) how often each view counts in each draw."""
     return np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
 
 
 def _resized_share(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> Array:
-    """(6, 6) covariance of T_flange_camera due to the uncertainty of the board's scale, for an unweighted method."""
+    """Return (6, 6) covariance of T_flange_camera due to the board's uncertain scale, for an unweighted method."""
     other = fit_resized(data, method, answer, answer.scale + answer.scale_sigma)
     step = _increment(other.T_flange_camera, answer.T_flange_camera)
     return np.outer(step, step)
 
 
 def _increment(after: Transform, before: Transform) -> Array:
-    """(6,) shift in metres and turn in radians, in the outer axes."""
+    """Return (6,) shift in metres and turn in radians, in the outer axes."""
     turn = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
     return np.concatenate([after[:3, 3] - before[:3, 3], turn])
 
 
 def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
-    """(6, 6) covariance of T_flange_camera due to the camera calibration's uncertainty, common to all images.
+    """Return (6, 6) covariance of T_flange_camera due to the camera calibration's uncertainty, common to all images.
 
     Board poses and then the mount are found again with cameras displaced by one standard deviation; by Park's closed
     form, which reacts to the camera's error as the other methods do.
@@ -93,7 +93,7 @@ def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
 
 
 def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraModel) -> Transform:
-    """T_camera_board of one view refined with another camera, starting from T."""
+    """Return T_camera_board of one view refined with another camera, starting from T."""
     seen = np.flatnonzero(np.isfinite(corners.corners_px[index]).all(axis=1))
     view = BoardView(seen, corners.corners_px[index][seen])
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
@@ -101,7 +101,7 @@ def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraMode
 
 
 def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Array) -> Array:
-    """The covariance (6, 6) with translation and rotation each scaled up to what held-out images require.
+    """Return the covariance (6, 6) with translation and rotation each scaled up to what held-out images require.
 
     A closed form has no noise model, and views with similar errors give similar resamples. But the mean of N views is
     not known better than their held-out scatter over the root of N.
@@ -118,10 +118,10 @@ def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Arra
     return covariance * np.outer(factor, factor)
 
 
-# The board's size by the robot's lengths: its ratio to the stated size, whether that is credible, and what it
+# The board's size by the robot's lengths: its ratio to the given size, whether that is credible, and what it
 # means.
 #
-# The stated size of a board scales the camera's distance from it. The robot is the second ruler: it moves by known
+# The given size of a board scales the camera's distance from it. The robot is the second ruler: it moves by known
 # lengths between the images. Where the two differ by more than the board's tolerance and the uncertainty of the
 # comparison, one of them is wrong, and a fit would hide the difference in the camera's position.
 
@@ -131,7 +131,7 @@ _SURE = 3.0  # standard deviations
 _UNEXPLAINED = 4.0  # times as much scatter in position as the rotations explain
 _USUAL_M = 1.5e-3  # along each axis; joints of which one errs more than the others reach this in position alone
 _LIKE = 0.05  # relative difference up to which a ratio counts as a known one
-#: Ratios of true to stated size that mistakes other than of the unit lead to.
+#: Ratios of true to given size that mistakes other than of the unit lead to.
 _KNOWN: tuple[tuple[float, str], ...] = (
     (2.0, "the distance of two rows of circles, or half a square, given for the whole has this ratio"),
     (0.5, "the distance of two circles in a row, or two squares, given for one has this ratio"),
@@ -143,14 +143,14 @@ _PRINTED = (0.85, 1.18)  # A4 on Letter and back, and the printers' "fit to page
 
 @dataclass(frozen=True, slots=True)
 class BoardSizeFound:
-    """The board's true size over the stated one, as the robot's lengths show it.
+    """The board's true size over the given one, as the robot's lengths show it.
 
     Attributes:
-        ratio: by robot and images alone.
+        ratio: the ratio by robot and images alone.
         sigma: standard deviation of `ratio`, without that of the robot's own lengths.
-        tolerance: stated for the board: the largest relative error of its size.
-        used: in the answer: `ratio` and the stated size, weighted.
-        square_m: the stated side of a square; None if none was stated.
+        tolerance: the board's given tolerance: the largest relative error of its size.
+        used: the ratio used in the answer: `ratio` and the given size, weighted.
+        square_m: the given side of a square; None if none was given.
     """
 
     ratio: float
@@ -161,7 +161,7 @@ class BoardSizeFound:
 
     @property
     def credible(self) -> bool:
-        """Whether the difference lies within tolerance, uncertainty and the arm's own lengths."""
+        """True if the difference lies within tolerance, uncertainty and the arm's own lengths."""
         return abs(self.ratio - 1) <= _SURE * float(np.hypot(self.sigma, _RULER)) + self.tolerance
 
     @property
@@ -198,17 +198,17 @@ def _likely(ratio: float) -> str:
 
 
 def size_sigma(tolerance: float) -> float:
-    """Standard deviation of a size whose error is anything within a tolerance."""
+    """Return the standard deviation of a size whose error is anything within a tolerance."""
     return tolerance / float(np.sqrt(3))
 
 
 def size_found(free: HandEyeSolution, used: float, board: Board | None, counts: Array) -> BoardSizeFound:
-    """The board's size by robot and images alone.
+    """Compute the board's size by robot and images alone.
 
     Args:
         free: answer of the weighted fit that knows nothing of the board's size.
-        used: the board's scale in the answer that weighs the stated size too.
-        board: as described; None: its size is exactly known.
+        used: the board's scale in the answer that weighs the given size too.
+        board: the board as described; None: its size is exactly known.
         counts: (R, N) how often each view counts in each replicate of a bootstrap.
     """
     assert free.views is not None
@@ -220,7 +220,7 @@ def size_found(free: HandEyeSolution, used: float, board: Board | None, counts: 
 
 
 def contradictions(data: HandEyeMeasurements, answer: HandEyeSolution) -> tuple[str, ...]:
-    """What robot and images say differently, in words, though they agree on the board's size.
+    """Describe how robot and images contradict each other, though they agree on the board's size.
 
     An arm errs by its joints' angles, so its positions err by no more than its rotations do at the length of the arm.
     Positions that scatter more than that contradict the images in another way.

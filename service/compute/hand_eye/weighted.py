@@ -12,7 +12,7 @@ prior φ ~ N(0, s²) in units of usual tolerances. Where φ is large, the report
 φ0, and e is the increment from there plus G_i φ0. The variances σ_t², σ_r² and s² maximise the restricted likelihood
 (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
 
-κ is the board's true size over the stated one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
+κ is the board's true size over the given one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
 board's tolerance. It scales the translation of T_camera_board. Without it, a board printed at 97 % moves the camera
 along its axis by 3 % of the distance, and where the distance hardly varies, no residual shows it.
 """
@@ -50,13 +50,13 @@ class BoardViews:
     """Measurements of N board views.
 
     Attributes:
-        T_base_flange: (N, 4, 4) as reported, corrected by the arm's parameters `about`.
-        T_camera_board: (N, 4, 4) from the images.
-        covariance: (N, 6, 6) of T_camera_board: (d, w) in the camera's axes.
+        T_base_flange: (N, 4, 4) poses as reported, corrected by the arm's parameters `about`.
+        T_camera_board: (N, 4, 4) poses by the images.
+        covariance: (N, 6, 6) covariance of T_camera_board: (d, w) in the camera's axes.
         design: (N, 6, K) derivative of the flange's increment by the arm's parameters; K may be 0.
         kind: (K,) index into `Noise.scales` of each parameter's prior scale.
         about: (K,) the arm's parameters at which `design` is the derivative.
-        size_sigma: relative standard deviation of the board's stated size.
+        size_sigma: relative standard deviation of the board's given size.
         scales_weight: the scales of the geometry are known to be about 1 as if that many parameters showed it: few
             images show few lengths, and a scale of these alone would vanish where they are right by chance.
     """
@@ -72,7 +72,7 @@ class BoardViews:
 
     @property
     def size_precision(self) -> float:
-        """Inverse variance of the board's stated size."""
+        """Inverse variance of the board's given size."""
         return 1 / max(self.size_sigma, _LEAST_SIGMA) ** 2
 
     def take(self, which: NDArray[np.bool_]) -> BoardViews:
@@ -104,7 +104,7 @@ class Fit:
 
     T_flange_camera: Transform
     T_base_board: Transform
-    scale: float  # of the board: true size over the stated one
+    scale: float  # of the board: true size over the given one
     arm: Array
     covariance: Array  # (13 + K, 13 + K): T_flange_camera, T_base_board, each (d, w) in its outer axes; scale; arm
 
@@ -115,7 +115,7 @@ class Fit:
 
 
 def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[Array, Array, Array]:
-    """Increments e (N, 6) of the flange, their derivative (N, 6, 12) by X and B, and (N, 6, 6) by the board's pose.
+    """Return the flange's increments e (N, 6), and derivatives (N, 6, 12) by X and B, (N, 6, 6) by the board's pose.
 
     All increments are (d, w) of exp(w) R, t + d in the transform's outer axes; those of e in the flange's axes.
     """
@@ -147,7 +147,7 @@ def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[
 
 
 def _rows(views: BoardViews, fit: Fit) -> tuple[Array, Array]:
-    """(N, 6, P + 1) rows [J | e] of each view at an answer, P = 13 + K, and the images' covariance (N, 6, 6) of e."""
+    """Return rows [J | e] (N, 6, P + 1) of views at an answer, P = 13 + K, and the images' covariance (N, 6, 6)."""
     boards = scaled(views.T_camera_board, fit.scale)
     e, J, JM = linearise(views.T_base_flange, boards, fit.T_flange_camera, fit.T_base_board)
     by_scale = np.einsum("nij,nj->ni", JM[:, :, :3], views.T_camera_board[:, :3, 3])
@@ -157,14 +157,14 @@ def _rows(views: BoardViews, fit: Fit) -> tuple[Array, Array]:
 
 
 def _grams(views: BoardViews, noise: Noise, fit: Fit) -> Array:
-    """(N, P + 1, P + 1) Gram matrices of each view's whitened rows."""
+    """Return (N, P + 1, P + 1) Gram matrices of each view's whitened rows."""
     rows, images = _rows(views, fit)
     white = np.linalg.solve(np.linalg.cholesky(_robot(noise) + images), rows)
     return np.swapaxes(white, 1, 2) @ white
 
 
 def _with_prior(gram: Array, views: BoardViews, scale: float) -> Array:
-    """A summed Gram matrix with the board's stated size as one more row."""
+    """Return a summed Gram matrix with the board's given size as one more row."""
     row = np.zeros(len(gram))
     row[_SCALE], row[-1] = 1.0, scale - 1
     return gram + views.size_precision * np.outer(row, row)
@@ -179,7 +179,7 @@ def _prior(noise: Noise, kind: NDArray[np.int64]) -> Array:
 
 
 def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
-    """Step (P,), covariance (P, P) and ½ log|H| from a summed Gram matrix (P + 1, P + 1) and the arm's prior.
+    """Return step (P,), covariance (P, P) and ½ log|H| from a summed Gram matrix (P + 1, P + 1) and the arm's prior.
 
     Raises:
         ComputeError: the system is singular.
@@ -197,7 +197,7 @@ def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
 
 
 def _factor(scaled: Array) -> Array:
-    """Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError if it is singular."""
+    """Return the Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError if it is singular."""
     try:
         L = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
     except np.linalg.LinAlgError as error:
@@ -208,18 +208,18 @@ def _factor(scaled: Array) -> Array:
 
 
 def start_at(X: Transform, B: Transform, scale: float, count: int = 0) -> Fit:
-    """T_flange_camera, T_base_board and the board's scale as a start, with `count` parameters of the arm."""
+    """Return T_flange_camera, T_base_board and the board's scale as a start, with `count` parameters of the arm."""
     return Fit(X, B, scale, np.zeros(count), np.zeros((_COMMON + count,) * 2))
 
 
 def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITERATIONS) -> Fit:
-    """Gauss–Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
+    """Solve the least squares weighted by `noise` with Gauss–Newton, in increments scaled by the normal matrix.
 
     Args:
         views: the measurements.
         noise: standard deviations from `estimate_noise`.
-        start: from which transforms and scale to start.
-        iterations: largest number.
+        start: the initial transforms and scale.
+        iterations: largest number of iterations.
 
     Raises:
         ComputeError: the views do not determine the answer.
@@ -227,7 +227,7 @@ def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITE
     prior = _prior(noise, views.kind)
 
     def minimum_at(fit: Fit) -> tuple[Array, Array]:
-        """The step from `fit` to the minimum of the linearised problem, and the covariance of all parameters."""
+        """Return the step from `fit` to the linearised problem's minimum, and the covariance of all parameters."""
         gram = _with_prior(_grams(views, noise, fit).sum(axis=0), views, fit.scale)
         step, covariance, _ = _minimum(gram, prior)
         return np.concatenate([step[:_COMMON], step[_COMMON:] - fit.arm]), covariance
@@ -251,10 +251,10 @@ def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITE
 
 
 def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
-    """Standard deviations that maximise the restricted likelihood, linearised near the answer.
+    """Estimate the standard deviations that maximise the restricted likelihood, linearised near the answer.
 
     Args:
-        views: without outliers.
+        views: the measurements without outliers.
         near: the answer, approximately.
         start: initial values, with one scale for each kind of arm parameter.
         floor_m: smallest robot noise; the same number in radians for the rotation.
@@ -263,7 +263,7 @@ def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float
     members = np.array([views.kind == g for g in range(len(start.scales))], dtype=np.float64)
 
     def objective(logs: Array) -> tuple[float, Array]:
-        """Half the deviance and its gradient."""
+        """Return half the deviance and its gradient."""
         noise = _noise(logs)
         prior = _prior(noise, views.kind)
         L = np.linalg.cholesky(_robot(noise) + images)
@@ -303,15 +303,16 @@ def _noise(logs: Array) -> Noise:
 
 
 def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np.int64]) -> Noise:
-    """A prior scale for each group of arm parameters; those that the data do not need go to zero.
+    """Estimate a prior scale for each group of arm parameters; those that the data do not need go to zero.
 
     Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe, then
     MacKay's fixed point, which is fast. A gear errs at one or two of its harmonics, not at all of them. Once these
-    are found, they can be told from the other joints' errors, and hold beyond the joint angles that were visited.
+    are found, they can be separated from the other joints' errors, and hold beyond the joint angles that were
+    visited.
 
     Args:
-        views: as for `solve`.
-        noise: with the initial scales, in the groups of `views.kind`.
+        views: the measurements.
+        noise: noise with the initial scales, in the groups of `views.kind`.
         near: the answer, approximately.
         groups: (K,) group of each parameter.
 
@@ -335,7 +336,7 @@ def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np
 
 
 def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
-    """(R, 13 + K) increments of the answer if view i counts `counts[r, i]` times: the replicates of a bootstrap.
+    """Return increments (R, 13 + K) of the answer if view i counts `counts[r, i]` times: replicates of a bootstrap.
 
     One Gauss-Newton step from the answer, which is exact to second order in the replicates' spread.
     """
@@ -347,9 +348,9 @@ def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
 
 
 def prior_share(views: BoardViews, noise: Noise, fit: Fit) -> Array:
-    """(13 + K, 13 + K) part of the answer's covariance that is due to what was known before the images.
+    """Return (13 + K, 13 + K) part of the answer's covariance that is due to what was known before the images.
 
-    The images pull the board's size and the arm's parameters away from their stated values only as far as they
+    The images pull the board's size and the arm's parameters away from their given values only as far as they
     determine them. The rest of their errors stays, however often the images are resampled.
     """
     pull = fit.covariance[:, _SCALE:]
@@ -358,7 +359,7 @@ def prior_share(views: BoardViews, noise: Noise, fit: Fit) -> Array:
 
 
 def mahalanobis(views: BoardViews, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
-    """(N,) squared Mahalanobis distances of the views' increments from the model, with 6 degrees of freedom each.
+    """Return (N,) squared Mahalanobis distances of views' increments from the model, each of 6 degrees of freedom.
 
     With `known`, the fit's own uncertainty counts too: it is added to the noise of views not in the fit and
     subtracted from that of views in the fit (studentised residuals).

@@ -36,10 +36,10 @@ class BundleSolution:
     """The adjusted state.
 
     Attributes:
-        state: cameras, points, bases, camera.
-        sigmas: of the components, estimated.
+        state: the adjusted cameras, points, bases and camera model.
+        sigmas: the estimated sigmas of the components.
         weights: robust weight of each measurement, by component.
-        covariance: (n, n) of the frame parameters, points eliminated.
+        covariance: (n, n) covariance of the frame parameters, points eliminated.
         chi2: reduced chi square of each component, with robust weights and its own redundancy.
         steps: number of linearisations.
     """
@@ -53,7 +53,7 @@ class BundleSolution:
 
 
 def solve(state: BundleState, data: AdjustmentData, sigmas: Sigmas, *, rounds: int = 3) -> BundleSolution:
-    """Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
+    """Adjust by Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
 
     The variances are Förstner's estimates: each component's weighted sum of squares over its redundancy (Koch,
     Parameter Estimation and Hypothesis Testing in Linear Models, 3.6).
@@ -89,7 +89,7 @@ def solve(state: BundleState, data: AdjustmentData, sigmas: Sigmas, *, rounds: i
 
 
 def first_guess(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Sigmas:
-    """Sigmas with the tracks' from the median of their residuals, so that robust weights work from the start."""
+    """Set the tracks' sigma by the median of their residuals, so that robust weights work from the start."""
     squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
         "tracks"
     ].squares
@@ -137,7 +137,7 @@ def _descend(
 
 
 def _weights(rows: dict[str, Rows]) -> dict[str, Array]:
-    """Cauchy weights of the measurements of each component; priors have weight one."""
+    """Return Cauchy weights of the measurements of each component; priors have weight one."""
     return {
         name: 1 / (1 + r.squares / CAUCHY[name] ** 2) if name in CAUCHY else np.ones(len(r.squares))
         for name, r in rows.items()
@@ -156,7 +156,7 @@ def _cost(rows: dict[str, Rows]) -> float:
 
 
 def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) -> dict[str, float]:
-    """Redundancy of each component: its rows less the parameters that they determine."""
+    """Return the redundancy of each component: its rows less the parameters that they determine."""
     out: dict[str, float] = {}
     left = float(sum(len(r.residual) for r in weighted.values()) - len(covariance) - normal.cross.shape[1])
     for name, r in weighted.items():
@@ -170,7 +170,7 @@ def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) ->
 
 
 def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, float]) -> Sigmas:
-    """Sigmas for the next round; a component with almost no redundancy keeps its own."""
+    """Return the sigmas for the next round; a component with almost no redundancy keeps its own."""
 
     def factor(name: str) -> float:
         return math.sqrt(chi2[name]) if redundancy.get(name, 0) >= 6 and chi2[name] > 0 else 1.0
@@ -185,7 +185,7 @@ def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, flo
 
 
 def robust_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[str, Rows]:
-    """Rows of every component with their robust weights."""
+    """Return the rows of every component with their robust weights."""
     rows = linearise(state, data, sigmas)
     weights = _weights(rows)
     return {name: r.weighted(weights[name]) for name, r in rows.items()}
@@ -238,7 +238,7 @@ EXPECTED = {name: _expected(scale, 2 if name == "tracks" else 3) for name, scale
 
 
 def stated_covariance(weighted: dict[str, Rows], n: int) -> Array:
-    """Covariance (n, n) of the frame parameters, from every component's rows with their robust weights.
+    """Return the covariance (n, n) of the frame parameters, from every component's rows with their robust weights.
 
     Raises:
         ComputeError: the data leave a parameter undetermined.
@@ -255,7 +255,7 @@ def stated_covariance(weighted: dict[str, Rows], n: int) -> Array:
 
 
 def clustered_information(tracks: Rows, n: int) -> tuple[Array, Array]:
-    """H and M (n, n) of weighted tracks, points eliminated, for the covariance H^-1 M H^-1 of the frame parameters.
+    """Return H, M (n, n) of weighted tracks, points eliminated, for the covariance H^-1 M H^-1 of frame parameters.
 
     M is estimated from the scores of whole tracks, so it holds even if the errors within a track are correlated. With
     G tracks the plain sum of squared scores has rank G at most: for fewer tracks than parameters it would state that
@@ -278,7 +278,7 @@ def clustered_information(tracks: Rows, n: int) -> tuple[Array, Array]:
 
 
 def _shrunk(scores: csr_matrix, information: Array) -> Array:
-    """Sum (n, n) of squared scores (G, n), shrunk towards a multiple of the information."""
+    """Return the sum (n, n) of squared scores (G, n), shrunk towards a multiple of the information."""
     total = (scores.T @ scores).toarray()
     diagonal = np.diag(information)
     d = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 0.0)
@@ -299,7 +299,7 @@ def _shrunk(scores: csr_matrix, information: Array) -> Array:
 
 
 def reduced_rows(rows: Rows, normal: Normal) -> Array:
-    """Derivative (R, n) of a component's residuals by the frame parameters, while the points follow these.
+    """Return the derivative (R, n) of a component's residuals by the frame parameters, while the points follow these.
 
     A point's increment is -V^-1 W^T times the frame's, where V and W are the points' blocks of `normal`.
     """
@@ -307,7 +307,7 @@ def reduced_rows(rows: Rows, normal: Normal) -> Array:
 
 
 def taken_by_points(rows: Rows, normal: Normal) -> float:
-    """Trace of P V^-1 P^T: how many of a component's rows (derivative P by the points) the points themselves take."""
+    """Return the trace of P V^-1 P^T: how many of a component's rows (derivative P by the points) the points take."""
     return float(rows.point.multiply(rows.point @ _inverse_of_points(normal)).sum())
 
 
@@ -317,7 +317,7 @@ def _inverse_of_points(normal: Normal) -> bsr_matrix:
 
 
 def inverse_information(information: Array) -> Array:
-    """Inverse (n, n) of an information matrix.
+    """Return the inverse (n, n) of an information matrix.
 
     Raises:
         ComputeError: it is singular.
@@ -337,7 +337,7 @@ def inverse_information(information: Array) -> Array:
 
 
 def _ratio(name: str, quantity: Literal["slope", "influence"]) -> float:
-    """Expected slope or variance of a component's score over its expected weight; one for priors, which have none."""
+    """Return the expected slope or variance of a component's score over its expected weight; one for priors."""
     if name not in EXPECTED:
         return 1.0
     expected = EXPECTED[name]

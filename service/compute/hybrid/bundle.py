@@ -81,7 +81,7 @@ class Rows:
     size: int  # rows per measurement, which share a robust weight
 
     def weighted(self, weights: Array) -> Rows:
-        """The rows multiplied by the square root of their measurement's weight (R / size,)."""
+        """Return the rows multiplied by the square root of their measurement's weight (R / size,)."""
         root = np.repeat(np.sqrt(weights), self.size)
         scale = coo_matrix((root, (np.arange(len(root)), np.arange(len(root))))).tocsr()
         return Rows(self.residual * root, (scale @ self.frame).tocsr(), (scale @ self.point).tocsr(), self.size)
@@ -93,17 +93,17 @@ class Rows:
 
 
 def width(state: BundleState, data: AdjustmentData) -> int:
-    """Number of frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
+    """Count the frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
     return lens_column(state, data) + (len(LENS) if data.lens_covariance is not None else 0)
 
 
 def common_column(state: BundleState) -> int:
-    """First column of the errors that all outlines share."""
+    """Return the first column of the errors that all outlines share."""
     return 6 * (len(state.cameras) + len(state.bases))
 
 
 def lens_column(state: BundleState, data: AdjustmentData) -> int:
-    """First column of the lens."""
+    """Return the first column of the lens."""
     return common_column(state) + (len(COMMON) if data.sightings is not None else 0)
 
 
@@ -118,7 +118,7 @@ class Normal:
     point_gradient: Array  # (Q, 3)
 
     def step(self, damping: float) -> tuple[Array, Array]:
-        """Increment of the frame parameters (n,) and of the points (Q, 3)."""
+        """Return the increment of the frame parameters (n,) and of the points (Q, 3)."""
         diagonal = np.diag(self.schur)
         d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled = self.schur * np.outer(d, d) + damping * np.eye(len(d))
@@ -128,7 +128,7 @@ class Normal:
 
 
 def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
-    """Normal equations of all rows, with the points eliminated.
+    """Build the normal equations of all rows, with the points eliminated.
 
     Raises:
         ComputeError: a point is not determined by its observations.
@@ -159,7 +159,7 @@ def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
 
 
 def moved(state: BundleState, data: AdjustmentData, frame: Array, points: Array) -> BundleState:
-    """The state after an increment of the frame parameters (n,) and the points (Q, 3)."""
+    """Return the state after an increment of the frame parameters (n,) and the points (Q, 3)."""
     n, g = len(state.cameras), len(state.bases)
     camera = state.camera
     if data.lens_covariance is not None:
@@ -184,12 +184,12 @@ def _turned(poses: Array, steps: Array) -> Array:
 
 
 def whitening_of(covariance: Array) -> Array:
-    """(..., k, k) W with W C W^T = I for covariances C."""
+    """Return (..., k, k) W with W C W^T = I for covariances C."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64)
 
 
 def linearise(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[str, Rows]:
-    """Rows of every component in the data: tracks, spheres, centres, common, robot_position …, lens."""
+    """Return the rows of every component in the data: tracks, spheres, centres, common, robot_position …, lens."""
     out = {"tracks": _track_rows(state, data, sigmas)}
     if data.sightings is not None:
         out["spheres"] = _sphere_rows(state, data, sigmas)
@@ -203,7 +203,7 @@ def linearise(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[
 
 
 def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose and (O, 3, 3) by the point."""
+    """Return points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose, (O, 3, 3) by the point."""
     R, t = cameras[:, :3, :3], cameras[:, :3, 3]
     v = points - t
     Rt = np.swapaxes(R, 1, 2)
@@ -266,7 +266,7 @@ def _sphere_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Ro
 
 
 def _lens_derivative(camera: CameraModel, pixels: Array, plane: Array) -> Array:
-    """(O, 2, 4) derivative of the undistorted coordinates of fixed pixels by fx, fy, cx, cy."""
+    """Return (O, 2, 4) derivative of the undistorted coordinates of fixed pixels by fx, fy, cx, cy."""
     out = np.empty((len(pixels), 2, len(LENS)))
     for k, name in enumerate(LENS):
         nudged = dataclasses.replace(camera, **{name: getattr(camera, name) + 0.5})
@@ -287,7 +287,7 @@ class _Observed:
 
 
 def _rows(state: BundleState, data: AdjustmentData, seen: _Observed) -> Rows:
-    """Sparse rows from dense derivatives."""
+    """Return the sparse rows from dense derivatives."""
     n_obs, k = seen.residual.shape
     row = np.arange(n_obs * k).reshape(n_obs, k, 1)
     columns = [np.broadcast_to(6 * seen.image[:, None, None] + np.arange(6), seen.d_pose.shape)]
@@ -311,7 +311,7 @@ def _sparse(row: NDArray[Any], column: NDArray[Any], values: NDArray[Any], shape
 
 
 def _centre_rows(state: BundleState, data: AdjustmentData) -> Rows:
-    """Rows of the spheres' measured positions in the scan."""
+    """Return the rows of the spheres' measured positions in the scan."""
     assert data.centres is not None
     assert data.centre_whitening is not None
     m, first = len(data.centres), len(data.tracks.points)
@@ -323,7 +323,7 @@ def _centre_rows(state: BundleState, data: AdjustmentData) -> Rows:
 
 
 def _common_rows(state: BundleState, data: AdjustmentData) -> Rows:
-    """Rows of the prior of the errors that all outlines share."""
+    """Return the rows of the prior of the errors that all outlines share."""
     assert data.common_sigma_px is not None
     count = len(COMMON)
     row, column = np.arange(count)[:, None], common_column(state) + np.arange(count)[:, None]
@@ -364,7 +364,7 @@ def _robot_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> tup
 
 
 def _lens_rows(state: BundleState, data: AdjustmentData) -> Rows:
-    """Rows of the lens calibration, as an observation of the lens."""
+    """Return the rows of the lens calibration, as an observation of the lens."""
     assert data.calibrated is not None
     assert data.lens_covariance is not None
     whitening = whitening_of(data.lens_covariance)

@@ -36,7 +36,7 @@ _RIM = 12  # rays of an outline that are recomputed
 
 
 def camera_share(solution: BundleSolution, data: AdjustmentData, known: CameraCovariance) -> Array:
-    """Covariance (n, n) of the frame parameters due to the camera's covariance, to be added to the solution's.
+    """Return the covariance (n, n) of the frame parameters due to the camera's, to be added to the solution's.
 
     For each deviation of the camera, this takes the step that the adjustment would make with that camera: robust
     weights fixed, points adjusted, cones recomputed from the outlines' pixels.
@@ -61,7 +61,7 @@ def camera_share(solution: BundleSolution, data: AdjustmentData, known: CameraCo
 
 
 def _read_by(sightings: SphereSightings | None, held: CameraModel, other: CameraModel) -> SphereSightings | None:
-    """The outlines' cones recomputed from the same pixels with another camera model."""
+    """Compute the outlines' cones again from the same pixels with another camera model."""
     if sightings is None:
         return None
     azimuth = np.linspace(0.0, 2 * np.pi, _RIM, endpoint=False)
@@ -91,12 +91,13 @@ class HybridOptions:
             given.
         common_errors: prior sizes of the errors that all outlines share, which are estimated; None:
             `EXPECTED_COMMON_ERRORS`.
-        most_observations: of tracks used; more gain almost nothing and cost time and memory.
+        most_observations: largest number of observations of tracks used; more gain almost nothing and cost time and
+            memory.
         robot_sigma_m: initial sigma of the robot's positions; estimated from the data.
         robot_sigma_rad: initial sigma of its orientations; estimated from the data.
         track_sigma_px: initial sigma of the tracks; estimated from the data.
-        lens_covariance: (4, 4) of the calibrated fx, fy, cx, cy, to refine them with the calibration as a prior;
-            None: the camera is fixed.
+        lens_covariance: (4, 4) covariance of the calibrated fx, fy, cx, cy, to refine them with the calibration as a
+            prior; None: the camera is fixed.
     """
 
     sphere_sigma_m: float = 5e-6
@@ -116,21 +117,22 @@ class HybridPoses:
     covariances are exp(w) R, t + d in the axes of the outer frame, metres and radians.
 
     Attributes:
-        T_scan_camera: (N, 4, 4).
-        T_world_camera: (N, 4, 4).
+        T_scan_camera: (N, 4, 4) camera poses in the scan frame.
+        T_world_camera: (N, 4, 4) camera poses in the world frame.
         T_world_scan: the registration.
-        T_world_group: base of each group.
+        T_world_group: the base of each group.
         points_scan: (P, 3) scene points used.
         covariance: (6 (N + G), 6 (N + G)) joint, of every image's T_scan_camera, then of every group's T_scan_base.
         camera_share: part of it due to the camera's own uncertainty; zero if that was not given.
-        camera: as given, or refined.
-        sigma_track_px: of one observation of a track.
-        sphere_factor: of the outlines' residuals over their own sigmas.
-        sigma_robot_m, sigma_robot_rad: of the robot's poses per axis, including systematic errors; None without a
-            robot.
+        camera: the camera as given, or refined.
+        sigma_track_px: standard deviation of one observation of a track.
+        sphere_factor: ratio of the outlines' residuals to their own sigmas.
+        sigma_robot_m, sigma_robot_rad: standard deviations of the robot's poses per axis, including systematic
+            errors; None without a robot.
         chi2: reduced chi square of each component: tracks, spheres, centres, robot_position, robot_rotation, lens.
-        registration: of the scan to the poses of structure from motion, from which the adjustment started.
-        centre_scan_m: (3,) mean of the spheres.
+        registration: the registration of the scan to the poses of structure from motion, from which the adjustment
+            started.
+        centre_scan_m: (3,) mean of the spheres' centres.
     """
 
     T_scan_camera: Array
@@ -162,7 +164,7 @@ class HybridPoses:
         return np.array([joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(self.T_world_camera))])
 
     def joint_world_covariance(self) -> Array:
-        """(6 N + 6, 6 N + 6) of every image's T_world_camera and, last, of T_world_scan."""
+        """Return (6 N + 6, 6 N + 6) of every image's T_world_camera and, last, of T_world_scan."""
         n = len(self.T_scan_camera)
         J = np.zeros((6 * n + 6, len(self.covariance)))
         R = self.T_world_scan[:3, :3]
@@ -184,7 +186,7 @@ class HybridPoses:
         return self.joint_world_covariance()[-6:, -6:]
 
     def sigma_at_m(self, point_scan_m: Array) -> float:
-        """Predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
+        """Return the predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
 
         For the set of images as a whole, aligned to the true one by its camera positions: errors of single images
         average out, common errors remain.
@@ -215,13 +217,13 @@ def hybrid_poses(
     """Adjust tracks, spheres and robot poses together.
 
     Args:
-        images: with poses from structure from motion, in any frame and scale, and the camera with which the outlines
-            were made. Their stations are those of the robot.
-        tracks: of the same model.
-        outlines: per image, from the detector.
+        images: the images with poses from structure from motion, in any frame and scale, and the camera by which the
+            outlines were made. Their stations are those of the robot.
+        tracks: tracks of the same model.
+        outlines: the detector's outlines of each image.
         spheres: the registration spheres; without a covariance, options.sphere_sigma_m.
-        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in its station's base frame; NaN
-            for images without a robot pose. None: only the spheres give the metric frame.
+        T_base_camera: (N, 4, 4) poses by the robot and the hand-eye calibration, each in its station's base frame;
+            NaN for images without a robot pose. None: only the spheres give the metric frame.
         known_camera: covariance of a fixed camera, which is propagated to the poses. None: taken as exact.
         options: settings.
 
@@ -266,7 +268,7 @@ def hybrid_poses(
 def _data(
     tracks: Tracks, sightings: SphereSightings, spheres: ScanSpheres, camera: CameraModel, settings: HybridOptions
 ) -> AdjustmentData:
-    """The measurements of tracks and spheres, with their priors."""
+    """Return the measurements of tracks and spheres, with their priors."""
     common = settings.common_errors or EXPECTED_COMMON_ERRORS
     covariance = spheres.covariance_m2
     if covariance is None:
@@ -311,7 +313,7 @@ def _answer(
 
 
 def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationResult) -> SphereSightings:
-    """The outlines that the registration used; a marker that it never used keeps its position in the scan."""
+    """Return the outlines that the registration used; a marker that it never used keeps its position in the scan."""
     used = [r for r in start.residuals if not r.excluded]
     found = [outlines[r.image][r.outline] for r in used]
     whitening = whitening_of(np.array([o.cone_covariance for o in found]))
@@ -326,7 +328,7 @@ def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationR
 def _bases(
     T_scan_camera: Array, T_base_camera: Array | None, stations: NDArray[np.int64]
 ) -> tuple[Array, list[int], NDArray[np.int64]]:
-    """Initial T_scan_base (G, 4, 4), the groups in order, and each image's index among them."""
+    """Return the initial T_scan_base (G, 4, 4), the groups in order, and each image's index among them."""
     if T_base_camera is None:
         return np.empty((0, 4, 4)), [], np.zeros(len(stations), dtype=np.int64)
     known = np.isfinite(T_base_camera).all(axis=(1, 2))
@@ -352,7 +354,7 @@ def _block(a: Array, b: Array) -> Array:
 
 
 def _relative(R_world_scan: Array, lever_scan: Array) -> Array:
-    """(6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base; lever: x's origin minus the base's."""
+    """Return (6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base; lever: from base to x."""
     out = _block(-R_world_scan, -R_world_scan)
     out[:3, 3:] = R_world_scan @ skew(lever_scan)
     return out

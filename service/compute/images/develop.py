@@ -44,19 +44,19 @@ class Crop:
 
 @dataclass(frozen=True, slots=True)
 class Development:
-    """What is recorded of a development.
+    """The record of a development.
 
     Attributes:
-        parameters: fixed ones.
+        parameters: the fixed parameters.
         white_balance: gains of red, green, blue and second green that the camera recorded (0: as the first green).
-        black_level: of the four photosites of the pattern.
-        white_level: of the sensor's values.
+        black_level: black level of the four photosites of the pattern.
+        white_level: white level of the sensor's values.
         area: width and height of the exposed area.
-        crop: of the picture in it.
+        crop: the picture's crop in it.
         shift_px: median shift of the picture against the JPEG in x and y; None without a JPEG.
-        largest_shift_px: of a part of the picture; None without a JPEG.
-        rawpy: its version.
-        libraw: its version.
+        largest_shift_px: largest shift of a part of the picture; None without a JPEG.
+        rawpy: rawpy's version.
+        libraw: LibRaw's version.
     """
 
     parameters: DevelopParameters
@@ -126,12 +126,12 @@ def develop(path: Path, jpeg_bgr: NDArray[np.uint8] | None, parameters: DevelopP
 
 
 def encode_tiff(image_bgr: Pixels16) -> bytes:
-    """A picture (H, W, 3) BGR as a TIFF with 16 bits a channel, compressed without loss."""
+    """Encode a picture (H, W, 3) BGR as a TIFF with 16 bits a channel, compressed without loss."""
     return cv2.imencode(".tif", image_bgr, _TIFF)[1].tobytes()
 
 
 def read_developed(path: Path) -> Pixels16:
-    """(H, W, 3) BGR of a TIFF that `encode_tiff` wrote. Raises DataError if it is not such a file."""
+    """Read (H, W, 3) BGR of a TIFF that `encode_tiff` wrote. Raises DataError if it is not such a file."""
     data = np.fromfile(path, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
@@ -144,12 +144,12 @@ def read_developed(path: Path) -> Pixels16:
 
 
 def coded(linear: Pixels16) -> Pixels16:
-    """Linear values as sRGB-coded ones with 16 bits (IEC 61966-2-1)."""
+    """Encode linear values as sRGB-coded ones with 16 bits (IEC 61966-2-1)."""
     return _CODE[linear]
 
 
 def eight_bits(coded_bgr: Pixels16) -> NDArray[np.uint8]:
-    """sRGB-coded values with 16 bits, rounded to 8."""
+    """Return sRGB-coded values with 16 bits, rounded to 8."""
     return ((coded_bgr.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
@@ -172,7 +172,7 @@ def _rawpy() -> Any:
 
 
 def _options(rawpy: Any, parameters: DevelopParameters) -> dict[str, Any]:
-    """The parameters as rawpy takes them; those that it would otherwise choose by the content are set too."""
+    """Return the parameters as rawpy takes them; those that it would otherwise choose by the content are set too."""
     names = [algorithm.name for algorithm in rawpy.DemosaicAlgorithm]
     if parameters.demosaic not in names:
         raise ConfigurationError(
@@ -197,7 +197,7 @@ def _options(rawpy: Any, parameters: DevelopParameters) -> dict[str, Any]:
 
 
 def _named_crop(sizes: Any) -> Crop:
-    """The crop that the file names, in pixels of the developed area; all of the area if it names none."""
+    """Return the crop that the file names, in pixels of the developed area; all of the area if it names none."""
     left, top = sizes.crop_left_margin - sizes.left_margin, sizes.crop_top_margin - sizes.top_margin
     inside = left >= 0 and top >= 0 and left + sizes.crop_width <= sizes.width
     if sizes.crop_width and inside and top + sizes.crop_height <= sizes.height:
@@ -208,7 +208,7 @@ def _named_crop(sizes: Any) -> Crop:
 def _matched(
     area: Pixels16, jpeg_bgr: NDArray[np.uint8], named: Crop, path: Path
 ) -> tuple[Crop, tuple[float, float], float]:
-    """The crop whose pixels are the JPEG's, its shift against the JPEG, and the largest shift of a part."""
+    """Return the crop whose pixels are the JPEG's, its shift against the JPEG, and the largest shift of a part."""
     height, width = jpeg_bgr.shape[:2]
     room = area.shape[1] - width, area.shape[0] - height
     if min(room) < 0 or max(room) > _MOST_ROOM_PX:
@@ -250,7 +250,7 @@ def _part(picture: _P, crop: Crop) -> _P:
 
 
 def _words(error: Exception) -> str:
-    """LibRaw's message."""
+    """Return LibRaw's message."""
     first = error.args[0] if error.args else ""
     return first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first or type(error).__name__)
 
@@ -269,7 +269,7 @@ class Shift:
     """The shift of a second picture's content against the first, in x and y, over the parts that show one.
 
     Attributes:
-        median_px: of all parts; what is at p in the first is at p + shift in the second.
+        median_px: median shift over all parts; what is at p in the first is at p + shift in the second.
         largest_px: length of the largest shift of a part.
         parts: number of parts that show a shift.
     """
@@ -280,12 +280,12 @@ class Shift:
 
     @property
     def certain(self) -> bool:
-        """Whether enough parts show a shift."""
+        """True if enough parts show a shift."""
         return self.parts >= _FEWEST
 
 
 def find_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Shift:
-    """The shift between two grey pictures (H, W) of one size, in parts all over them.
+    """Find the shift between two grey pictures (H, W) of one size, in parts all over them.
 
     Phase correlation (Kuglin and Hines 1975) finds it to a pixel; least squares on the pixels to hundredths. Neither
     depends on the brightness or the contrast, which differ between a JPEG and a developed raw file.
@@ -306,7 +306,7 @@ def find_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Shift:
 
 
 def _shift_of(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[float, float] | None:
-    """The shift of a part; None if its content does not show one."""
+    """Return the shift of a part; None if its content does not show one."""
     window = cv2.createHanningWindow((a.shape[1], a.shape[0]), cv2.CV_32F)
     rough, response = cv2.phaseCorrelate(a.copy(), b.copy(), window)  # it multiplies them by the window in place
     if response < _LEAST_RESPONSE:
@@ -315,13 +315,13 @@ def _shift_of(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[float, fl
 
 
 def _refined(a: NDArray[np.float32], b: NDArray[np.float32], start: Array) -> tuple[float, float] | None:
-    """The shift by Gauss–Newton (Lucas and Kanade 1981), with gain and offset of the brightness estimated along."""
+    """Estimate the shift by Gauss–Newton (Lucas and Kanade 1981), with gain and offset of the brightness."""
     a, b = (np.asarray(cv2.GaussianBlur(part, (0, 0), _SMOOTH_PX), dtype=np.float32) for part in (a, b))
     inner = slice(_MARGIN_PX, -_MARGIN_PX)
     aim = a[inner, inner].astype(np.float64).ravel()
 
     def linearised(shift: Array) -> tuple[Array, Array, Array]:
-        """Rows of the equations, their normal matrix, and their solution: gain, offset, gain times the step."""
+        """Return rows of the equations, normal matrix, and solution: gain, offset, gain times the step."""
         # Splines: cv2.warpAffine rounds positions to 1/32 px, and the steps would never end.
         moved = ndimage.shift(b, (-shift[1], -shift[0]), order=3, mode="reflect")[inner, inner]
         dy, dx = np.gradient(moved.astype(np.float64))
@@ -351,7 +351,7 @@ def _refined(a: NDArray[np.float32], b: NDArray[np.float32], start: Array) -> tu
 
 
 def _parts(height: int, width: int) -> Iterator[tuple[slice, slice]]:
-    """Rows and columns of parts that are spread over a picture, its corners included."""
+    """Yield the rows and columns of parts that are spread over a picture, its corners included."""
     side = min(_TILE_PX, height, width)
     for top in np.linspace(0, height - side, _TILES[1]).astype(int):
         for left in np.linspace(0, width - side, _TILES[0]).astype(int):

@@ -7,18 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class DevelopParameters:
-    """How every raw file is developed; recorded with each picture, and the same for all.
+    """The parameters with which every raw file is developed; recorded with each picture, and the same for all.
 
     Attributes:
         demosaic: LibRaw's algorithm, by rawpy's name of it; chosen by bench/markers/raw_gain.py.
         white_balance: `camera`: the gains that the camera recorded for the exposure.
-        primaries: of the picture's colours; the colour matrix is the file's or, without one, LibRaw's for the model.
+        primaries: primaries of the picture's colours; the colour matrix is the file's or, without one, LibRaw's for
+            the model.
         gamma: power and slope of the transfer curve; 1, 1 is linear.
-        highlights: what becomes of saturated channels.
-        auto_brightness: whether the content decides the brightness.
-        noise_reduction: of any kind.
+        highlights: treatment of saturated channels.
+        auto_brightness: true if the content decides the brightness.
+        noise_reduction: true if noise is reduced in any way.
         orientation: 0: as the sensor read it out.
-        bits: of a channel.
+        bits: bits of a channel.
     """
 
     demosaic: str = "VNG"

@@ -35,10 +35,10 @@ _REMEDY = "Copy the file from the camera again, and use JPEG or PNG images"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as stored, after checking that it is complete; a JPEG is not decoded.
+    """Return width and height of an image as stored, after checking that it is complete; a JPEG is not decoded.
 
     Raises:
-        DataError: as `read_image`.
+        DataError: the file is missing, truncated or not a decodable image.
     """
     data = _checked(path)
     if data.startswith(JPEG_BEGINS):
@@ -48,7 +48,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def _checked(path: Path) -> bytes:
-    """The content of an image file, which decides its kind, not its name."""
+    """Return the content of an image file, which decides its kind, not its name."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -71,7 +71,7 @@ def _unreadable(path: Path, error: OSError) -> DataError:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
+    """Read (H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
 
     Raises:
         DataError: the file is missing, truncated or not a decodable image.
@@ -80,10 +80,10 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """(H, W) brightness as stored (a JPEG's luma, at full resolution), in a third of the memory of `read_image`.
+    """Read the (H, W) brightness as stored (a JPEG's luma, at full resolution), in a third of `read_image`'s memory.
 
     Raises:
-        DataError: as `read_image`.
+        DataError: the file is missing, truncated or not a decodable image.
     """
     return _decode(path, cv2.IMREAD_GRAYSCALE)
 
@@ -97,10 +97,10 @@ def _decoded(data: bytes, path: Path, how: int) -> NDArray[np.uint8]:
 
 
 def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
-    """`read_image` for an image of the camera's size.
+    """Read an image of the camera's size with `read_image`.
 
     Raises:
-        DataError: as `read_image`, or the image has another size.
+        DataError: the file is missing, truncated or not a decodable image, or the image has another size.
     """
     image = read_image(path)
     if image.shape[:2] != (camera.height, camera.width):
@@ -114,12 +114,12 @@ def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
 
 
 def read_reduced(path: Path, camera: CameraModel, least_width: int) -> tuple[NDArray[np.uint8], CameraModel]:
-    """The image reduced to a half, a quarter or an eighth, at least `least_width` wide, and its camera.
+    """Read the image reduced to a half, a quarter or an eighth, at least `least_width` wide, and its camera.
 
     A JPEG is decoded at that size, which takes a third of the time and at an eighth 1/64 of the memory.
 
     Raises:
-        DataError: as `read_image_of`.
+        DataError: the file is missing, truncated or not a decodable image, or the image has another size.
     """
     reduction = next((k for k in (8, 4, 2) if camera.width // k >= least_width), 1)
     if reduction == 1:
@@ -161,18 +161,18 @@ class ImageFolder:
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
     def without(self, reasons: dict[str, str]) -> ImageFolder:
-        """The folder without these images, whose reasons are added."""
+        """Return the folder without these images, whose reasons are added."""
         kept = tuple(file for file in self.files if file.name not in reasons)
         return ImageFolder(kept, self.left_out | reasons)
 
 
 def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: bool = False) -> ImageFolder:
-    """The images of a folder, each checked to be complete, unique and of the wanted size.
+    """List the images of a folder, each checked to be complete, unique and of the wanted size.
 
     Args:
         folder: subfolders are not searched.
         size: width and height that the images must have; None: the most common size.
-        strict: whether odd files are errors too.
+        strict: true if odd files are errors too.
 
     Raises:
         DataError: the folder does not exist, has no image (of the size), or has damaged ones (all are counted); with
@@ -212,7 +212,7 @@ def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: b
 
 
 def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
-    """The error for odd files with `--strict`."""
+    """Return the error for odd files with `--strict`."""
     return DataError(
         f"{counted(len(reasons), 'odd file')}: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
         where=str(folder),
@@ -221,7 +221,7 @@ def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
 
 
 def _sizes(files: Sequence[Path], folder: Path) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
-    """The sizes of the images, and the reasons why others, though whole, are not read."""
+    """Return the sizes of the images, and the reasons why others, though whole, are not read."""
     sizes: dict[str, tuple[int, int]] = {}
     foreign: dict[str, str] = {}
     damaged: list[str] = []
@@ -245,7 +245,7 @@ def _sizes(files: Sequence[Path], folder: Path) -> tuple[dict[str, tuple[int, in
 
 
 def _copies(files: Sequence[Path]) -> dict[str, str]:
-    """Images that are byte-for-byte copies of an earlier one, with reasons."""
+    """Return the images that are byte-for-byte copies of an earlier one, with reasons."""
     alike: defaultdict[int, list[Path]] = defaultdict(list)
     for file in files:
         alike[file.stat().st_size].append(file)
@@ -273,13 +273,13 @@ REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.
 
 
 def decode(content: bytes, how: int, *, name: str, remedy: str) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR or (H, W) of a picture file.
+    """Decode a picture file as (H, W, 3) BGR or (H, W).
 
     Args:
-        content: of the file, which has been checked (service.core.picture_files).
+        content: the file's content, which has been checked (service.core.picture_files).
         how: flags of cv2.imdecode.
-        name: of the file, for the error.
-        remedy: what the reader of the error should do.
+        name: the file's name, for the error.
+        remedy: advice to the reader of the error.
 
     Raises:
         DataError: OpenCV cannot decode it.
@@ -300,14 +300,14 @@ _SHOWN_REMEDY = "Download the recorded file and look at it; it is kept unchanged
 def decode_reduced(
     content: bytes, width_px: int, name: str, *, upright: bool = False
 ) -> tuple[NDArray[np.uint8], int]:
-    """A JPEG or PNG as (H, W, 3) BGR, at most `width_px` wide, and its width as stored.
+    """Decode a JPEG or PNG as (H, W, 3) BGR, at most `width_px` wide; return its width as stored too.
 
     It is decoded at an eighth, a quarter or half of its size if that is wide enough, because 60 MP take long.
 
     Args:
-        content: of the file.
+        content: the file's content.
         width_px: narrower pictures keep their width.
-        name: of the file, for messages.
+        name: the file's name, for messages.
         upright: rotate by the orientation tag; otherwise the pixels are as stored, like those that are measured.
 
     Raises:
@@ -346,7 +346,7 @@ class ImageQuality:
     Attributes:
         edge_px: median width of its clearest edges (height over steepest slope); 2 to 4 in a sharp image, NaN if it
             has none.
-        black: whether hardly any pixel is brighter than black.
+        black: true if hardly any pixel is brighter than black.
     """
 
     edge_px: float
@@ -354,7 +354,7 @@ class ImageQuality:
 
 
 def image_quality(grey: NDArray[np.uint8]) -> ImageQuality:
-    """Quality of an image (H, W); takes some milliseconds per megapixel examined, at most three."""
+    """Return the quality of an image (H, W); takes some milliseconds per megapixel examined, at most three."""
     dark = float(np.percentile(grey[::4, ::4], 99)) < _DARK
     return ImageQuality(float("nan") if dark else _edge_px(grey), dark)
 
@@ -383,7 +383,7 @@ def _middle(part: NDArray[np.int64]) -> slice:
 
 
 def _edges(tile: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Height and steepest slope of every edge in a tile."""
+    """Return the height and steepest slope of every edge in a tile."""
     smooth = np.asarray(cv2.GaussianBlur(tile, (0, 0), _SIGMA_PX), dtype=np.float32)
     across = (smooth[1:-1, 2:] - smooth[1:-1, :-2]) / 2
     along = (smooth[2:, 1:-1] - smooth[:-2, 1:-1]) / 2

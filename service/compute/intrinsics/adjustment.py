@@ -38,7 +38,7 @@ class BoardSurface:
     """The points of a board that may be bent.
 
     Attributes:
-        points: (K, 3) of the flat board, m.
+        points: (K, 3) points of the flat board, m.
         bends: (K, S) displacement along z of each point by a unit of each term; S is 0 for a board that is flat.
         sigma_m: standard deviation of each term, before any image.
     """
@@ -48,14 +48,14 @@ class BoardSurface:
     sigma_m: float
 
     def bent(self, bow_m: Array) -> Array:
-        """(K, 3) points of the board with these terms (S,)."""
+        """Return (K, 3) points of the board with these terms (S,)."""
         out = self.points.copy()
         out[:, 2] += self.bends @ bow_m
         return out
 
 
 def flat_surface(points: Array) -> BoardSurface:
-    """The surface of a board that is exactly as `points` (K, 3)."""
+    """Return the surface of a board that is exactly as `points` (K, 3)."""
     return BoardSurface(points, np.zeros((len(points), 0)), 1.0)
 
 
@@ -114,32 +114,32 @@ class Adjustment:
     sigma_px: float  # robust standard deviation of one coordinate
 
     def T_camera_board(self) -> Array:
-        """(N, 4, 4) poses of the board in the views."""
+        """Return (N, 4, 4) poses of the board in the views."""
         return np.stack([pose_matrix(pose) for pose in self.poses])
 
 
 def rms(residual: Array) -> float:
-    """Two-dimensional root mean square of residuals (2M,)."""
+    """Return the two-dimensional root mean square of residuals (2M,)."""
     return float(np.sqrt(np.sum(residual**2) / (len(residual) / 2)))
 
 
 def pose_matrix(pose: Array) -> Transform:
-    """The transform of OpenCV's rvec and tvec (6,)."""
+    """Return the transform of OpenCV's rvec and tvec (6,)."""
     return transform(Rotation.from_rotvec(pose[:3]), pose[3:])
 
 
 def camera_of(parameters: Array, size: tuple[int, int]) -> CameraModel:
-    """The camera of the first P of PARAMETERS; the others are zero."""
+    """Return the camera of the first P of PARAMETERS; the others are zero."""
     return CameraModel(*size, *(float(v) for v in parameters))
 
 
 def parameters_of(camera: CameraModel, count: int) -> Array:
-    """The first `count` PARAMETERS of a camera, the inverse of `camera_of`."""
+    """Return the first `count` PARAMETERS of a camera, the inverse of `camera_of`."""
     return np.array([getattr(camera, name) for name in PARAMETERS[:count]])
 
 
 def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tuple[Array, Array, Array]:
-    """Pixels (M, 2) of board points (M, 3) and their derivatives by the pose (2M, 6) and all parameters (2M, 12)."""
+    """Return pixels (M, 2) of board points (M, 3), and derivatives by pose (2M, 6) and all parameters (2M, 12)."""
     terms = np.zeros(8)
     terms[: len(camera.distortion)] = camera.distortion
     pixels, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], camera.matrix, terms)
@@ -148,7 +148,7 @@ def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tu
 
 
 def prior_precision(count: int) -> Array:
-    """(count,) diagonal that the weak prior on k3 … k6 adds to the normal matrix; zero for the other terms."""
+    """Return (count,) diagonal that the weak prior on k3 … k6 adds to the normal matrix; zero for the other terms."""
     precision = np.zeros(count)
     precision[8:] = _PRIOR**2
     return precision
@@ -157,7 +157,7 @@ def prior_precision(count: int) -> Array:
 def start(
     views: Sequence[BoardView], points: Array, size: tuple[int, int], model: LensModel
 ) -> tuple[CameraModel, Array]:
-    """An initial camera from some of the views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
+    """Estimate an initial camera from some views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
 
     Raises:
         ComputeError: no camera or no pose explains the views.
@@ -186,7 +186,7 @@ def start(
 
 
 def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
-    """(6,) rvec and tvec of one view by a known camera.
+    """Return (6,) rvec and tvec of one view by a known camera.
 
     Raises:
         ComputeError: no pose explains the corners.
@@ -204,7 +204,7 @@ def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
 
 
 def fit_pose(view: BoardView, points: Array, camera: CameraModel, pose: Array) -> tuple[Array, float]:
-    """The pose (6,) of one view refined from `pose` with a known camera, and its RMS error in px."""
+    """Return the pose (6,) of one view refined from `pose` with a known camera, and its RMS error in px."""
 
     def at(pose: Array) -> _ViewPose:
         pixels, J, _ = project_with_jacobian(points[view.indices], pose, camera)
@@ -241,7 +241,7 @@ def adjust(
     bow_m: Array | None = None,
     iterations: int = _MAX_ITERATIONS,
 ) -> Adjustment:
-    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS, the board's bow and every pose.
+    """Adjust the camera's first `parameters` PARAMETERS, the board's bow and every pose by Levenberg-Marquardt.
 
     Corners have Huber weights.
 
@@ -251,13 +251,13 @@ def adjust(
 
     Args:
         views: (N) corners, px.
-        surface: of the board.
+        surface: the board's surface.
         size: width and height, px.
         camera: initial camera.
         poses: (N, 6) initial rvec and tvec (m).
         parameters: number estimated; the others keep their values in `camera` (zero).
         bow_m: (S,) initial bow; None: flat.
-        iterations: largest number.
+        iterations: largest number of iterations.
 
     Raises:
         ComputeError: the equations are singular, or the solution did not stay finite.
@@ -309,8 +309,8 @@ class _Linearised:
 
     Attributes:
         scale: robust scale of the corners in px by which the cost was taken.
-        present: that of the residuals here.
-        step: of the camera, by which it was reached; None at the beginning.
+        present: robust scale of the residuals here.
+        step: the camera's step by which it was reached; None at the start.
     """
 
     theta: Array
@@ -335,7 +335,7 @@ def _settles(here: _Linearised, there: _Linearised) -> bool:
 
 
 def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:
-    """The equations for boards T_camera_board (N, 4, 4) whose points (K, 3) are seen exactly as expected.
+    """Return the equations for boards T_camera_board (N, 4, 4) whose points (K, 3) are seen exactly as expected.
 
     Residuals are zero and corners have a standard deviation of 1 px: this predicts what images will determine.
     """
@@ -362,7 +362,7 @@ def _linearise(
     size: tuple[int, int],
     scale: float | None = None,
 ) -> tuple[tuple[ViewEquations, ...], float, float]:
-    """Equations of every view, Huber's cost at `scale` (default: the current one), and the current robust scale."""
+    """Return every view's equations, Huber's cost at `scale` (default: the current one), and the current scale."""
     terms = surface.bends.shape[1]
     lens, bow = np.split(theta, [len(theta) - terms])
     camera, points = camera_of(lens, size), surface.bent(bow)

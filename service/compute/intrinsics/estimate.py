@@ -56,17 +56,17 @@ class IntrinsicsResult:
         rms_px: root mean square of all corners' reprojection errors (two-dimensional).
         views: (N,) input indices of the views used.
         corners: (N) their corners.
-        per_view_rms_px: (N,) the same for each view.
+        per_view_rms_px: (N,) root mean square for each view.
         parameters: (P) names, in the order of the covariance.
         covariance: (P, P), px and 1: from the corners' noise, estimated from the residuals, times `inflation`.
-        joint_covariance: (P + S, P + S) of the parameters and the S terms of the board's bow (m); S is 0 for a
-            board that is stated to be exactly flat.
+        joint_covariance: (P + S, P + S) covariance of the parameters and the S terms of the board's bow (m); S is 0
+            for a board that is exactly flat by its description.
         inflation: ratio of the variance to that from independent corners, at least 1. The corners of one image share
             errors (light, flatness of the board, lens model); the disagreement between images shows how large these
             are.
         sigma: standard deviation of each parameter, the roots of the covariance's diagonal.
-        sigma_independent: the same from corner noise alone, as most programs report it.
-        sigma_by_image: the same from the disagreement of the images alone; NaN for fewer than 6 views.
+        sigma_independent: standard deviations from corner noise alone, as most programs report them.
+        sigma_by_image: standard deviations from the disagreement of the images alone; NaN for fewer than 6 views.
         leave_one_out: (N, P) change of the parameters when one view is left out (one Newton step).
         sigma_corner_px: standard deviation of one coordinate of a corner, from the residuals.
         T_camera_board: (N, 4, 4); board frame: x along the columns, y along the rows, z away from the camera.
@@ -106,10 +106,10 @@ class IntrinsicsResult:
 def calibrate_intrinsics(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], *, model: LensModel = "opencv4"
 ) -> IntrinsicsResult:
-    """Calibrate a camera from views of a board that is flat, or bent within its stated flatness.
+    """Calibrate a camera from views of a board that is flat, or bent within its given flatness.
 
     The bow of a board acts on the views like another lens: a tenth of a millimetre changes the focal length by ten of
-    the standard deviations that a fit without it would state. So its two terms are estimated with the camera.
+    the standard deviations that a fit without it would report. So its two terms are estimated with the camera.
 
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, with OpenCV's distortion.
     k3 … k6 have a weak prior (`prior_precision`), which takes effect only if the images do not determine them.
@@ -118,7 +118,7 @@ def calibrate_intrinsics(
     that fits the final camera after all is readmitted. Outlying corners within a view are downweighted (Huber).
 
     Args:
-        views: from `find_board`.
+        views: views from `find_board`.
         board: the board in the views.
         size: width and height of the images, px.
         model: pinhole (no distortion), radial2 (k1, k2), opencv4 (and p1, p2), opencv5 (and k3), rational (k1 … k6).
@@ -171,7 +171,7 @@ def calibrate_intrinsics(
 
 
 def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Transform, float]:
-    """T_camera_board of one view by a calibrated camera, and its RMS reprojection error in px.
+    """Return T_camera_board of one view by a calibrated camera, and its RMS reprojection error in px.
 
     Raises:
         ComputeError: no pose explains the corners.
@@ -182,7 +182,7 @@ def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Tra
 
 
 def surface_of(board: Board) -> BoardSurface:
-    """The board's surface as the stated flatness allows it to be bent."""
+    """Return the board's surface as the given flatness allows it to be bent."""
     flat = replace(board, bow_m=(0.0, 0.0))
     if board.flatness_m == 0:
         return flat_surface(board.points())
@@ -190,15 +190,15 @@ def surface_of(board: Board) -> BoardSurface:
 
 
 def bent(board: Board, bow_m: Array) -> Board:
-    """The board with an estimated bow (2,), or as it is for none (0,)."""
+    """Return the board with an estimated bow (2,), or as it is for none (0,)."""
     return replace(board, bow_m=(float(bow_m[0]), float(bow_m[1]))) if len(bow_m) else board
 
 
 def leave_one_out(solution: Adjustment) -> Array:
-    """(N, P + S) change of the parameters and the bow without each view, by one Newton step at the solution.
+    """Compute the (N, P + S) change of parameters and bow without each view, by one Newton step at the solution.
 
-    Without view i, the gradient at the solution is minus this view's part, g_i, and the normal matrix lacks its part,
-    S_i: d = (S - S_i)^-1 g_i. NaN if the other views do not determine the camera.
+    Without view i, the gradient at the solution is minus this view's part, g_i, and the normal matrix is less its
+    part, S_i: d = (S - S_i)^-1 g_i. NaN if the other views do not determine the camera.
     """
     normal = np.sum([view.normal for view in solution.views], axis=0) + np.diag(solution.prior)
     scale = np.sqrt(np.diag(normal))
@@ -211,7 +211,7 @@ def leave_one_out(solution: Adjustment) -> Array:
 
 
 def _usable(views: Sequence[BoardView], n_points: int) -> tuple[list[int], dict[int, str]]:
-    """The views with enough corners, and the reasons why the others are not used."""
+    """Return the views with enough corners, and the reasons why the others are not used."""
     used: list[int] = []
     reasons: dict[int, str] = {}
     for index, view in enumerate(views):
@@ -231,7 +231,7 @@ def _solve_without_outliers(
     used: list[int],
     reasons: dict[int, str],
 ) -> tuple[Adjustment, list[int]]:
-    """The solution and the views used; the reasons for the others are added to `reasons`."""
+    """Return the solution and the views used; the reasons for the others are added to `reasons`."""
     count, points = PARAMETER_COUNT[model], surface.points
     suspects: list[int] = []
     begin: tuple[CameraModel, Array] | None = None
@@ -285,7 +285,7 @@ def _check_view(view: BoardView, count: int, index: int) -> None:
 
 
 def _inverse_root(normal: Array) -> Array:
-    """R (P, P) with R Rᵀ = the inverse of the normal matrix: in its coordinates, the normal matrix is the identity.
+    """Return R (P, P) with R Rᵀ the inverse of the normal matrix, which is the identity in R's coordinates.
 
     Raises:
         ComputeError: the views do not determine the parameters.
@@ -301,7 +301,7 @@ def _inverse_root(normal: Array) -> Array:
 
 
 def _inflation(solution: Adjustment, root: Array, variance: float) -> tuple[float, Array]:
-    """Ratio of the covariance from images to that from corners, over all directions, and that from images (P, P).
+    """Return the covariances' ratio, images to corners, over all directions, and that from images (P, P).
 
     Each image's gradient is one sample of the errors that its corners share. It is corrected for the part that the
     solution has absorbed; otherwise few images would look too good. The shape of the covariance is still taken from
@@ -346,7 +346,7 @@ def _largest_angle_deg(directions: Array) -> float:
 
 
 def coverage_map_of(corners: Sequence[Array], size: tuple[int, int]) -> NDArray[np.int64]:
-    """(rows, columns) corners in each cell of the image."""
+    """Return (rows, columns) corners in each cell of the image."""
     edges = [np.linspace(-0.5, size[k] - 0.5, COVERAGE_GRID[k] + 1) for k in (1, 0)]
     everything = np.concatenate(corners)
     inside = np.clip(everything, -0.5, np.array(size) - 0.5)

@@ -64,7 +64,7 @@ class OpticsComparison:
 
 
 def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
-    """One line for each kind of difference, with the images that share it."""
+    """Return one line for each kind of difference, with the images that share it."""
     alike: dict[tuple[str, str, str], list[str]] = {}
     for departure in departures:
         alike.setdefault((departure.field, departure.found, departure.calibrated), []).append(departure.image)
@@ -78,7 +78,7 @@ def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
 def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> OpticsComparison:
     """Compare images with those of the calibration, property by property.
 
-    The calibrated value is the one that most of the calibration's images state. Focus, aperture and zoom change the
+    The calibrated value is the one that most of the calibration's images report. Focus, aperture and zoom change the
     focal length and the distortion; another lens, body or image size is another camera. Exposure time and ISO do not
     matter. Pass the calibration's own images as `capture` to check it for changes within.
 
@@ -125,7 +125,7 @@ def _same(field: str, value: object, reference: object) -> bool:
 
 
 def states_focus(optics: Sequence[Optics]) -> bool:
-    """Whether the images would reveal a change of focus; the focus mode alone does not."""
+    """Return whether the images would reveal a change of focus; the focus mode alone does not."""
     return all(one.focus_position is not None or one.focus_distance_m is not None for one in optics)
 
 

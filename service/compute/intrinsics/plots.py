@@ -20,7 +20,7 @@ Canvas = NDArray[np.uint8]
 
 
 def calibration_plots(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> dict[str, bytes]:
-    """PNG files by name: coverage, residuals, uncertainty.
+    """Return PNG files by name: coverage, residuals, uncertainty.
 
     Raises:
         ComputeError: an image cannot be encoded.
@@ -33,7 +33,7 @@ def calibration_plots(result: IntrinsicsResult, uncertainty: ProjectionUncertain
 
 
 def _coverage(result: IntrinsicsResult) -> Canvas:
-    """Number of corners in each cell, and the corners themselves."""
+    """Return the number of corners in each cell, and the corners themselves."""
     counts = result.coverage_map.astype(np.float64)
     canvas, scale = _frame(result, f"{result.coverage:.0%} of the cells hold a corner; {len(result.views)} views")
     _heat(canvas, 1 - 0.45 * counts / max(counts.max(), 1), cv2.COLORMAP_BONE, cv2.INTER_NEAREST)
@@ -49,7 +49,7 @@ def _coverage(result: IntrinsicsResult) -> Canvas:
 
 
 def _residuals(result: IntrinsicsResult) -> Canvas:
-    """Mean residual in each of 24 × 16 cells, which shows what the lens model misses, and each view's error."""
+    """Draw the mean residual in each of 24 × 16 cells, which shows what the lens model misses, and views' errors."""
     field, counts = residual_field(result)
     mean, enough = field.reshape(-1, 2), np.flatnonzero(counts >= _ENOUGH)
     cells = np.array(counts.shape[::-1])
@@ -76,7 +76,7 @@ def _residuals(result: IntrinsicsResult) -> Canvas:
 
 
 def _uncertainty(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> Canvas:
-    """Standard deviation of a projected point, with its values on the grid."""
+    """Return the standard deviation of a projected point, with its values on the grid."""
     field = uncertainty.sigma_px
     canvas, scale = _frame(
         result,
@@ -93,7 +93,7 @@ def _uncertainty(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -
 
 
 def _frame(result: IntrinsicsResult, title: str) -> tuple[Canvas, float]:
-    """A white canvas with the image's outline, and the canvas pixels per image pixel."""
+    """Return a white canvas with the image's outline, and the canvas pixels per image pixel."""
     scale = (_WIDTH - 2 * _MARGIN) / result.camera.width
     height = round(result.camera.height * scale)
     canvas = np.full((height + 2 * _MARGIN, _WIDTH, 3), 255, dtype=np.uint8)

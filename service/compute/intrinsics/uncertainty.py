@@ -23,15 +23,15 @@ class ProjectionUncertainty:
     """Standard deviation of a projected point in its worst direction, on a grid over the image.
 
     Attributes:
-        distance_m: of the points along the optical axis.
+        distance_m: distance of the points along the optical axis.
         pixels: (rows, columns, 2) positions of the grid.
-        sigma_px: (rows, columns).
-        sigma_mm: (rows, columns) the same at that distance, perpendicular to the line of sight.
-        centre_px: at the middle of the image.
-        worst_px: largest over the image.
+        sigma_px: (rows, columns) standard deviation.
+        sigma_mm: (rows, columns) standard deviation at that distance, perpendicular to the line of sight.
+        centre_px: standard deviation at the middle of the image.
+        worst_px: largest standard deviation over the image.
         rms_px: root mean square over the image.
-        centre_mm: at the middle of the image.
-        worst_mm: largest over the image.
+        centre_mm: standard deviation at the middle of the image.
+        worst_mm: largest standard deviation over the image.
         rms_mm: root mean square over the image.
     """
 
@@ -52,13 +52,13 @@ class EstimatedCamera:
     """A camera as determined by board images: the input of its projection uncertainty.
 
     Attributes:
-        camera: with `len(adjustment.parameters)` estimated parameters.
+        camera: the camera with `len(adjustment.parameters)` estimated parameters.
         board: the board in the images.
         corners: (N) the board's points in each image.
         adjustment: the equations at the solution.
-        covariance: (Q, Q) of the unknowns: the parameters, then the terms of the board's bow.
+        covariance: (Q, Q) covariance of the unknowns: the parameters, then the terms of the board's bow.
         bends: (K, S) displacement along the board's normal of each of its points by these terms; S may be 0.
-        variance: of one coordinate of a corner, px².
+        variance: variance of one coordinate of a corner, px².
     """
 
     camera: CameraModel
@@ -71,7 +71,7 @@ class EstimatedCamera:
 
 
 def board_distance_m(result: IntrinsicsResult) -> float:
-    """Median distance of the board's middle along the optical axis, m."""
+    """Return the median distance of the board's middle along the optical axis, m."""
     middle = np.append(result.board.points().mean(axis=0), 1.0)
     return float(np.median((result.T_camera_board @ middle)[:, 2]))
 
@@ -79,7 +79,7 @@ def board_distance_m(result: IntrinsicsResult) -> float:
 def projection_uncertainty(
     result: IntrinsicsResult, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
-    """Effect of the calibration's errors on projected points, without the part that the camera's pose absorbs.
+    """Propagate the calibration's errors to projected points, without the part that the camera's pose absorbs.
 
     A calibration determines a camera *and* its poses: a wrong principal point acts like a rotated camera. So the
     perturbed camera is first moved by the rigid motion that best aligns its view of the boards with the unperturbed
@@ -91,13 +91,13 @@ def projection_uncertainty(
         dq(p) = (dq/db + dq/dp [I, -[p]x] K) db + dq/dp [I, -[p]x] Σ H_i n_i
 
     and the covariance of dq follows, with the scale s² of `result.covariance` (including inflation).
-    Source: Kogan, mrcal, "Projection uncertainty", the form with a fitted implied transformation.
+    Source: Kogan, mrcal, "Projection uncertainty", the version with a fitted implied transformation.
 
     Args:
-        result: from `calibrate_intrinsics`.
-        distance_m: of the plane z = distance in the camera frame on which the projected points lie.
-        columns: of the grid.
-        rows: of the grid.
+        result: the result of `calibrate_intrinsics`.
+        distance_m: distance, along z of the camera frame, of the plane on which the projected points lie.
+        columns: number of the grid's columns.
+        rows: number of the grid's rows.
 
     Raises:
         DataError: the distance is not positive.
@@ -118,7 +118,7 @@ def projection_uncertainty(
 def uncertainty_of(
     result: EstimatedCamera, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
-    """`projection_uncertainty` for a camera determined by any images, including planned ones."""
+    """Compute `projection_uncertainty` for a camera determined by any images, including planned ones."""
     if not 0 < distance_m < np.inf:
         raise DataError(f"a distance of {distance_m} m is not in front of the camera")
     K, noise = _implied_motion(result)
@@ -159,7 +159,7 @@ def uncertainty_of(
 
 
 def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
-    """K (6, Q), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
+    """Return K (6, Q), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
 
     A point p in the camera frame before a change of parameters and poses is at p + d + w x p after it.
     """
@@ -184,7 +184,7 @@ def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
 
 
 def _point_by_pose(points: Array, pose: Array) -> Array:
-    """(3M, 6) derivative of R(rvec) p + t by rvec and tvec."""
+    """Return (3M, 6) derivative of R(rvec) p + t by rvec and tvec."""
     _, dR = cv2.Rodrigues(pose[:3])
     turns = np.asarray(dR, dtype=np.float64).reshape(3, 3, 3)  # by rvec k, then rows and columns of R
     by_rvec = np.einsum("kij,mj->mik", turns, points)
@@ -202,7 +202,7 @@ _TILT_DEG = 30.0
 _HELD_OUT_FACTOR = 1.3
 _INFLATION = 4.0
 _SIMPLE = ("pinhole", "radial2", "opencv4", "opencv5")  # models that a wide lens does not follow
-_WIDE = 0.5  # times as large residuals with the rational model tell a wide lens
+_WIDE = 0.5  # times as large residuals with the rational model indicate a wide lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +211,8 @@ class CrossValidation:
 
     Attributes:
         folds: number of parts into which the views were split.
-        five_fold_rms_px: over all views, each held out once.
-        five_fold_view_px: (N,).
+        five_fold_rms_px: root mean square over all views, each held out once.
+        five_fold_view_px: (N,) error of each view.
         leave_one_out_rms_px: each view judged by a calibration without it (one Newton step).
         leave_one_out_view_px: (N,); NaN if the other views do not determine the camera.
     """
@@ -225,7 +225,7 @@ class CrossValidation:
 
 
 def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidation:
-    """Five-fold and leave-one-out over the views of a calibration.
+    """Validate a calibration over its views, five-fold and leave-one-out.
 
     Raises:
         ComputeError: fewer than four views.
@@ -269,7 +269,7 @@ def _pooled(per_view_px: Array, counts: Array) -> float:
 
 
 def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) -> tuple[Array, NDArray[np.int64]]:
-    """Mean residual (rows, columns, 2), px, and number (rows, columns) of the corners in each cell of the image.
+    """Return the mean residual (rows, columns, 2), px, and number (rows, columns) of corners in each image cell.
 
     Noise averages out; what remains is the error of the lens model.
     """
@@ -286,7 +286,7 @@ def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) 
 
 
 def _wide_lens(result: IntrinsicsResult) -> list[str]:
-    """The warning that a lens is too wide for its model, if the rational one fits the same views far better."""
+    """Warn that a lens is too wide for its model, if the rational one fits the same views far better."""
     size = (result.camera.width, result.camera.height)
     try:
         wide = calibrate_intrinsics(result.corners, result.board, size, model="rational")
@@ -301,7 +301,7 @@ def _wide_lens(result: IntrinsicsResult) -> list[str]:
 
 
 def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> list[str]:
-    """Warnings that the images do not determine terms of the distortion."""
+    """Return warnings that the images do not determine terms of the distortion."""
     if result.model == "rational":
         # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
         if uncertainty.worst_px <= _RMS_PX:
@@ -320,7 +320,7 @@ def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) 
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
-    """Reasons to trust this calibration less, in words; empty if there are none."""
+    """Return reasons to trust this calibration less; empty if there are none."""
     found: list[str] = []
     n = len(result.views)
     if n < _VIEWS:

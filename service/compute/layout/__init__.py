@@ -1,1 +1,1 @@
-"""Whether placed spheres can be told apart, and which one to move if not."""
+"""Checks whether placed spheres can be distinguished, and which one to move if not."""

@@ -1,4 +1,4 @@
-"""Whether spheres can be told apart by their layout: the least misfit of any wrong assignment, and what to change."""
+"""Judges whether a layout distinguishes its spheres, by the least misfit of wrong assignments, and what to change."""
 
 from __future__ import annotations
 
@@ -65,18 +65,18 @@ class BoundedLength:
 
 @dataclass(frozen=True, slots=True)
 class LayoutReport:
-    """How well the spheres of a layout can be told apart.
+    """The margins by which the spheres of a layout can be distinguished.
 
     Attributes:
         margin: least misfit of any wrong assignment of any four spheres; noise must stay well below it.
-        margin_of_five: the same of five spheres; infinite if none was found.
+        margin_of_five: least misfit of any wrong assignment of any five spheres; infinite if none was found.
         worst: the assignments with the least misfit, least first.
         margin_by_count_m: least misfit by number of visible spheres (4, 5, … all).
         sphere_margins_m: (N,) least misfit of the assignments that mistake this sphere for another.
         depth: rms distance of the centres from their best plane.
         extent_m: rms distance of the centres from their mean.
-        largest_gap_rad: between neighbouring azimuths around the mean, in the best plane.
-        problems: what must be changed, in words; empty if the layout passes.
+        largest_gap_rad: largest gap between neighbouring azimuths around the mean, in the best plane.
+        problems: texts that say what must be changed; empty if the layout passes.
     """
 
     margin: BoundedLength
@@ -91,7 +91,7 @@ class LayoutReport:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing must be changed."""
+        """True if nothing must be changed."""
         return not self.problems
 
     @property
@@ -153,7 +153,7 @@ def check_layout(
 
 
 def _checked(centres_m: Array, radius_m: float) -> Array:
-    """The centres as numbers (N, 3). Raises DataError or ComputeError, as `check_layout` says."""
+    """Return the centres as numbers (N, 3). Raises DataError or ComputeError, as `check_layout` says."""
     centres = np.asarray(centres_m, dtype=np.float64)
     if centres.ndim != 2 or centres.shape[1] != 3 or not np.isfinite(centres).all():
         raise DataError(f"sphere centres of shape {centres.shape} are not points (N, 3)")
@@ -167,7 +167,7 @@ def _checked(centres_m: Array, radius_m: float) -> Array:
 
 
 def _sphere_margins(count: int, matches: Confusions) -> Array:
-    """For each sphere, (N,), the smallest misfit of an assignment that confuses it; infinite if there is none."""
+    """Return (N,) the smallest misfit of an assignment that confuses each sphere; infinite if there is none."""
     margins = np.full(count, np.inf)
     moved = matches.seen != matches.taken
     for column in range(SUBSET):
@@ -177,7 +177,7 @@ def _sphere_margins(count: int, matches: Confusions) -> Array:
 
 
 def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]:
-    """What must be changed, judged by the values themselves; gates judge the bounds."""
+    """Describe what must be changed, judged by the values themselves; gates judge the bounds."""
     problems: list[str] = []
     if report.margin_m < required_margin_m:
         first = report.worst[0]
@@ -201,7 +201,7 @@ def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]
 
 
 def layout_bounds(report: LayoutReport) -> dict[str, tuple[BoundedLength, float]]:
-    """The numbers of a layout that gates judge, by measure name, each with its required value (m)."""
+    """Return the numbers of a layout that gates judge, by measure name, each with its required value (m)."""
     found = {
         "layout_margin_mm": (report.margin, REQUIRED_MARGIN_M),
         "layout_margin_of_five_mm": (report.margin_of_five, REQUIRED_MARGIN_OF_FIVE_M),
@@ -211,7 +211,7 @@ def layout_bounds(report: LayoutReport) -> dict[str, tuple[BoundedLength, float]
 
 
 def layout_measures(report: LayoutReport) -> dict[str, float]:
-    """The numbers of a layout by measure name, lengths in mm; the same in every step."""
+    """Return the numbers of a layout by measure name, lengths in mm; the same in every step."""
     return {
         **{name: mm(bounded.value_m) for name, (bounded, _) in layout_bounds(report).items()},
         "layout_margin_sigma_mm": mm(report.margin.sigma_m),
@@ -224,7 +224,7 @@ _NO_BOUND = BoundedLength(np.inf, np.inf, np.inf)
 
 
 def _least(centres: Array, joint: Array | None, matches: Confusions) -> BoundedLength:
-    """The least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
+    """Return the least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
     if joint is None:
         least = float(matches.misfit.min())
         return BoundedLength(least, least, least)
@@ -234,7 +234,7 @@ def _least(centres: Array, joint: Array | None, matches: Confusions) -> BoundedL
 
 
 def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> BoundedLength:
-    """RMS height over the best plane, with the first-order variance of a singular value."""
+    """Return the RMS height over the best plane, with the first-order variance of a singular value."""
     n = len(centres)
     depth = float(singular[2] / np.sqrt(n))
     if joint is None:
@@ -246,7 +246,7 @@ def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) ->
 
 
 def _joint(covariance: Array | None, n: int) -> Array | None:
-    """(3N, 3N) covariance of all centres; None if nothing is known."""
+    """Return (3N, 3N) covariance of all centres; None if nothing is known."""
     if covariance is None or covariance.ndim == 2:
         return covariance
     joint = np.zeros((n, 3, n, 3))

@@ -26,7 +26,7 @@ class BoundedMisfits:
 
 
 def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
-    """Rms distance (M,) after the best proper rigid motion of each assignment (M, n). Source: as `align_points`."""
+    """Return rms distance (M,) after the best rigid motion of each assignment (M, n). Source: as `align_points`."""
     if len(seen) == 0:
         return np.empty(0)
     a, b, _, S = _aligned(centres, seen, taken)
@@ -35,14 +35,14 @@ def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
 
 
 def _rigid_motions(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array]:
-    """R (M, 3, 3) and t (M, 3) of the rigid motion that best maps `seen` onto `taken`."""
+    """Return R (M, 3, 3) and t (M, 3) of the rigid motion that best maps `seen` onto `taken`."""
     _, _, R, _ = _aligned(centres, seen, taken)  # a ≈ R b
     turned = np.swapaxes(R, 1, 2)
     return turned, centres[taken].mean(axis=1) - np.einsum("mij,mj->mi", turned, centres[seen].mean(axis=1))
 
 
 def _aligned(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array, Array, Array]:
-    """Centred points a, b (M, n, 3), R (M, 3, 3) with a ≈ R b, and the singular values, the last one signed."""
+    """Return centred a, b (M, n, 3), R (M, 3, 3) with a ≈ R b, and the singular values, the last one signed."""
     a, b = centres[seen], centres[taken]
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
@@ -53,14 +53,14 @@ def _aligned(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Ar
 
 
 def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: IntArray) -> BoundedMisfits:
-    """Misfits of assignments (M, n) and one-sided bounds with probability CONFIDENCE each.
+    """Return the misfits of assignments (M, n) and one-sided bounds with probability CONFIDENCE each.
 
     The residuals r after the best motion have the covariance Q of the noise, less what a rigid motion absorbs. Then
     |r|² has the mean |r₀|² + tr Q and the variance 2 tr Q² + 4 r₀ᵀ Q r₀, with r₀ the true residuals; a gamma
     distribution with these two moments gives the bounds. Source: Satterthwaite (1946), for a non-central sum.
 
     Args:
-        centres: (N, 3).
+        centres: (N, 3) the spheres' centres.
         covariance: (3N, 3N) m².
         seen, taken: indices of the spheres and of those they are mistaken for.
     """
@@ -102,7 +102,7 @@ def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: In
 
 
 def _residual_covariance(covariance: Array, a: Array, R: Array, seen: IntArray, taken: IntArray) -> Array:
-    """(M, 3n, 3n) covariance of the residuals: the noise of both sides, less what a rigid motion absorbs."""
+    """Return (M, 3n, 3n) covariance of the residuals: the noise of both sides, less what a rigid motion absorbs."""
     M, n = seen.shape
     blocks = covariance.reshape(len(covariance) // 3, 3, -1, 3).transpose(0, 2, 1, 3)  # (N, N, 3, 3)
     ss = blocks[seen[:, :, None], seen[:, None, :]]
@@ -137,7 +137,7 @@ class Confusions:
 
 
 def confusions(centres: Array, beyond_m: float = 0.0) -> Confusions:
-    """All wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
+    """Return all wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
     between = distances(centres)
     tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
     while True:
@@ -150,7 +150,7 @@ def confusions(centres: Array, beyond_m: float = 0.0) -> Confusions:
 
 
 def similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
-    """Quadruples (M, 4) and others (M, 4) with equal pairwise distances, without the quadruple itself."""
+    """Return the quadruples (M, 4) and others (M, 4) with equal pairwise distances, without the quadruple itself."""
     n = len(between)
     seen = np.stack(np.triu_indices(n, 1), axis=1)
     taken = np.array([(p, q) for p in range(n) for q in range(n) if p != q])
@@ -188,12 +188,12 @@ def _extended(between: Array, seen: IntArray, taken: IntArray, tolerance: float)
 
 
 def distances(centres: Array) -> Array:
-    """(N, N) between all centres (N, 3)."""
+    """Return (N, N) distances between all centres (N, 3)."""
     return np.linalg.norm(centres[:, None] - centres[None], axis=2)
 
 
 def distinct(matches: Confusions, order: IntArray, most: int = 8) -> list[int]:
-    """Indices of the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
+    """Select the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
     chosen: list[int] = []
     known: set[frozenset[tuple[int, int]]] = set()
     for k in order[: 50 * most]:
@@ -208,7 +208,7 @@ def distinct(matches: Confusions, order: IntArray, most: int = 8) -> list[int]:
 
 
 def by_visible_count(centres: Array, matches: Confusions, order: IntArray) -> dict[int, Confusions]:
-    """The best assignments by number of visible spheres, best first; those of four are extended to more spheres."""
+    """Select the best assignments by number of visible spheres; those of four are extended to more spheres."""
     n = len(centres)
     seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
     found = {SUBSET: Confusions(seen, taken, matches.misfit[order[:2000]])}

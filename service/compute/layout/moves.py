@@ -1,4 +1,4 @@
-"""Suggests which sphere to move so that the spheres can be told apart, and shows the move to a person."""
+"""Suggests which sphere to move so that the spheres can be distinguished, and shows the move to a person."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Move:
     Attributes:
         sphere: its index.
         by_m: (3,) shift in the centres' frame.
-        margin_m: of the layout after this move and those before it.
+        margin_m: margin of the layout after this move and those before it.
     """
 
     sphere: int
@@ -46,7 +46,7 @@ class Move:
 
 
 def innermost(centres_m: Array, count: int) -> frozenset[int]:
-    """The `count` spheres nearest to the layout's middle: the control spheres on the specimen."""
+    """Return the `count` spheres nearest to the layout's middle: the control spheres on the specimen."""
     _, _, axes = np.linalg.svd(centres_m - centres_m.mean(axis=0), full_matrices=False)
     flat = (centres_m - centres_m.mean(axis=0)) @ axes[:2].T
     return frozenset(int(i) for i in np.argsort(np.linalg.norm(flat, axis=1), kind="stable")[:count])
@@ -60,16 +60,16 @@ def suggest_moves(
     fixed: Collection[int] = (),
     required_margin_m: float = REQUIRED_MARGIN_M,
 ) -> tuple[Move, ...]:
-    """Successive moves until no assignment can be confused; each is the one that leaves the largest margin.
+    """Suggest successive moves until no assignment can be confused; each is the one that leaves the largest margin.
 
     The margin of a move is the least over all places where a person following the advice may put the sphere.
 
     Args:
-        centres_m: (N, 3).
+        centres_m: (N, 3) the spheres' centres.
         up: (3,) unit vector away from the table, in the centres' frame.
         radius_m: radius of the spheres; moves keep them apart.
         fixed: spheres that cannot be moved.
-        required_margin_m: of four spheres.
+        required_margin_m: required margin of four spheres.
 
     Raises:
         ComputeError: no single move improves the layout.
@@ -109,14 +109,14 @@ def _moved(centres: Array, sphere: int, by: Array) -> Array:
 
 
 def _quick_rating(centres: Array, required: float) -> float:
-    """The margin over the required one, at most _AMPLE, minus one for each confusable assignment."""
+    """Return the margin over the required one, at most _AMPLE, minus one for each confusable assignment."""
     misfit = misfits(centres, *similar(distances(centres), 2 * np.sqrt(2.0) * _AMPLE * required))
     least = float(misfit.min(initial=_AMPLE * required)) / required
     return least - int(np.count_nonzero(misfit < required))
 
 
 def _rating(centres: Array, required: float) -> float:
-    """The least ratio of the layout's numbers to their required values, at most _AMPLE, minus one for each shortfall.
+    """Return the least ratio of a layout's numbers to their required values, at most _AMPLE, less one per shortfall.
 
     So among several insufficient moves, the best is the one that leaves the fewest confusable assignments.
     """
@@ -129,13 +129,13 @@ def _rating(centres: Array, required: float) -> float:
 
 
 def _around(trial: Array, sphere: int) -> list[Array]:
-    """The layout itself and variants with the sphere slightly displaced."""
+    """Return the layout itself and variants with the sphere slightly displaced."""
     offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * _PLACING_M
     return [_moved(trial, sphere, offset) for offset in offsets]
 
 
 def _involved(centres: Array, fixed: Collection[int], required: float) -> list[int]:
-    """The movable spheres that are most often mistaken for others."""
+    """Return the movable spheres that are most often mistaken for others."""
     found = confusions(centres, beyond_m=2 * required)
     moved = found.seen != found.taken
     count = np.bincount(
@@ -145,7 +145,7 @@ def _involved(centres: Array, fixed: Collection[int], required: float) -> list[i
 
 
 def _directions(up: Array) -> list[Array]:
-    """Shifts along the table combined with height changes, the short ones first."""
+    """Return the shifts along the table combined with height changes, the short ones first."""
     first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
@@ -159,7 +159,7 @@ def _directions(up: Array) -> list[Array]:
 
 
 def _fits(placed: Array, trial: Array, sphere: int, up: Array, radius_m: float) -> bool:
-    """Whether a sphere fits there: clear of the others, over the table, within their range of heights."""
+    """Return whether a sphere fits there: clear of the others, over the table, within their range of heights."""
     others = np.delete(distances(trial)[sphere], sphere)
     middle = placed.mean(axis=0)
     flat = placed - middle - np.outer((placed - middle) @ up, up)
@@ -183,7 +183,7 @@ class PhotographedMove:
     """A move in a photograph.
 
     Attributes:
-        words: what to do.
+        words: text that says what to do.
         from_px: (2,) the sphere's position in the image as captured.
         to_px: (2,) its position after the move along the table, before the change of height.
         higher_m: change of height.
@@ -198,14 +198,14 @@ class PhotographedMove:
 def show_move(
     move: Move, centres_m: Array, up: Array, T_photo_centres: Transform, camera: CameraModel, limit_m: float
 ) -> PhotographedMove:
-    """The move as seen in a photograph taken with `camera`.
+    """Show the move in a photograph taken with `camera`.
 
     Args:
-        move: in the centres' frame.
-        centres_m: (N, 3) before the move.
+        move: the move in the centres' frame.
+        centres_m: (N, 3) centres before the move.
         up: (3,) unit vector away from the table, in the centres' frame.
         T_photo_centres: maps that frame to the camera's.
-        camera: of the photograph.
+        camera: the photograph's camera.
         limit_m: required margin.
     """
     higher = float(move.by_m @ up)

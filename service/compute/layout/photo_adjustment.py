@@ -23,7 +23,7 @@ _LENS = 8  # focal length, fy over fx, cx, cy, k1, k2, p1, p2
 _ITERATIONS = 12
 _DONE = 1e-6  # metres and radians
 _LONGEST_STEP = 0.1
-# Outlines err by more than their stated covariance: chi² per coordinate in bench/results/outlines*.md.
+# Outlines err by more than their given covariance: chi² per coordinate in bench/results/outlines*.md.
 _OUTLINE_CHI2 = 1.5
 _DOUBTFUL = 3.5  # standard deviations beyond which an outline is downweighted
 
@@ -33,13 +33,13 @@ class LensPrior:
     """Prior standard deviations of a camera's parameters.
 
     Attributes:
-        focal: relative, common to all photographs.
-        refocused: relative, of one photograph's focal length against the others', since the lens may have been
+        focal: focal length, relative, common to all photographs.
+        refocused: focal length of one photograph against the others', relative, since the lens may have been
             refocused.
-        aspect: of fy over fx.
-        centre: of the principal point, relative to the image's width.
-        k1, k2: of radial distortion.
-        tangential: of p1 and p2.
+        aspect: ratio of fy to fx.
+        centre: principal point, relative to the image's width.
+        k1, k2: coefficients of radial distortion.
+        tangential: coefficients p1 and p2.
     """
 
     focal: float = 0.02
@@ -51,7 +51,7 @@ class LensPrior:
     tangential: float = 1e-3
 
     def sigmas(self) -> Array:
-        """(8,) standard deviations in the order of the lens parameters."""
+        """Return (8,) standard deviations in the order of the lens parameters."""
         return np.array(
             [self.focal, self.aspect, self.centre, self.centre, self.k1, self.k2, self.tangential, self.tangential]
         )
@@ -76,7 +76,7 @@ class SpherePhotograph:
 
     @classmethod
     def of(cls, camera: CameraModel, outlines: Sequence[SphereOutline]) -> SpherePhotograph:
-        """From the outlines that the detector found with this camera."""
+        """Build it from the outlines that the detector found with this camera."""
         return cls(
             camera,
             tuple(o.cone for o in outlines),
@@ -84,7 +84,7 @@ class SpherePhotograph:
         )
 
     def rim_px(self) -> Array:
-        """(n, 12, 2) points on every outline, in pixels of the image as captured."""
+        """Return (n, 12, 2) points on every outline, in pixels of the image as captured."""
         rays = [cone.rays(_RIM, np.full_like(_RIM, cone.half_angle_rad)) for cone in self.cones]
         return np.array([self.camera.project(r) for r in rays]).reshape(-1, len(_RIM), 2)
 
@@ -94,10 +94,10 @@ class AdjustedLayout:
     """The adjusted spheres and poses.
 
     Attributes:
-        centres_m: (N, 3) in the frame of the first photograph.
+        centres_m: (N, 3) centres in the frame of the first photograph.
         covariance: (3N, 3N) m² of all centres jointly, including the camera's uncertainty.
-        T_photo_first: for every photograph, maps the first photograph's frame to its own.
-        chi2: per degree of freedom; if above 1, the covariance is scaled by it.
+        T_photo_first: the map from the first photograph's frame to each photograph's own.
+        chi2: chi square per degree of freedom; if above 1, the covariance is scaled by it.
     """
 
     centres_m: Array
@@ -117,12 +117,12 @@ def adjust(
     """Adjust spheres, poses and camera to all outlines by Gauss–Newton with Huber weights.
 
     Args:
-        photographs: of the same camera.
-        spheres: for every photograph (n,), the sphere index of each outline.
+        photographs: photographs taken by one camera.
+        spheres: (n,) index of each outline's sphere, for every photograph.
         centres_m: (N, 3) initial centres; each sphere must be seen in some photograph.
         T_photo_first: initial poses; the first one stays the identity.
         radius_m: radius of the spheres, which defines the scale.
-        prior: of the camera.
+        prior: prior of the camera's parameters.
 
     Raises:
         ComputeError: no convergence, because the outlines do not fit together.
@@ -218,7 +218,7 @@ class _Problem:
         return slice(0, 3 * self.n_spheres + 6 * (self.n_photos - 1))
 
     def step(self, x: _State) -> tuple[Array, Array, float]:
-        """A Gauss–Newton step, the covariance of all unknowns, and chi² per degree of freedom."""
+        """Return a Gauss–Newton step, the covariance of all unknowns, and chi² per degree of freedom."""
         n_geometry = self.geometry.stop
         m, J = self._rows(x)
         n = J.shape[2]
@@ -245,7 +245,7 @@ class _Problem:
         return step, covariance, chi2
 
     def _rows(self, x: _State) -> tuple[Array, Array]:
-        """Differences (M, 3) of the outlines, and their derivative (M, 3, n) by all unknowns."""
+        """Return the differences (M, 3) of the outlines, and their derivative (M, 3, n) by all unknowns."""
         n_centres, n_geometry = 3 * self.n_spheres, self.geometry.stop
         seen = np.einsum("mij,mj->mi", x.rotations[self.photo], x.centres[self.sphere]) + x.shifts[self.photo]
         focal = x.focal[self.photo]
@@ -268,7 +268,7 @@ class _Problem:
         return m, J
 
     def moved(self, x: _State, step: Array) -> _State:
-        """The state after a step."""
+        """Return the state after a step."""
         n_centres, n_geometry = 3 * self.n_spheres, self.geometry.stop
         turns = step[n_centres:n_geometry].reshape(-1, 6)
         R = np.array(x.rotations)
@@ -285,7 +285,7 @@ class _Problem:
         )
 
     def _measure(self, seen: Array, lens: Array, focal: Array) -> Array:
-        """(M, 3) size and axis differences of the outlines from those of spheres at `seen` (M, 3).
+        """Return (M, 3) size and axis differences of the outlines from those of spheres at `seen` (M, 3).
 
         They are not ObservedCones.residuals, because the observed cones change with the lens: the rim's pixels are
         undistorted again and compared with the predicted cone.
@@ -307,13 +307,13 @@ class _Problem:
 
     @staticmethod
     def _derivative(measure: Callable[[Array], Array], m: Array, deltas: Array) -> Array:
-        """(M, 3, len(deltas)) derivatives by finite differences."""
+        """Return (M, 3, len(deltas)) derivatives by finite differences."""
         steps = np.diag(deltas)
         return np.stack([(measure(d) - m) / h for d, h in zip(steps, deltas, strict=True)], axis=2)
 
 
 def _undistorted(xd: Array, yd: Array, distortion: Array) -> Array:
-    """Unit rays (M, 12, 3) of distorted normalised coordinates, by fixed-point iteration as in OpenCV."""
+    """Return the unit rays (M, 12, 3) of distorted normalised coordinates, by fixed-point iteration as in OpenCV."""
     k1, k2, p1, p2 = distortion
     x, y = xd, yd
     for _ in range(6):

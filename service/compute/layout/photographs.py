@@ -35,12 +35,12 @@ class PhotoLayout:
     """The spheres of all photographs in one frame.
 
     Attributes:
-        centres_m: (N, 3) in the frame of the leading photograph.
+        centres_m: (N, 3) centres in the frame of the leading photograph.
         covariance: (3N, 3N) m² of all centres jointly.
-        spheres: for every photograph, the sphere of each of its outlines (-1: none); an empty array if the photograph
-            could not be used.
-        T_photo_first: for every photograph, maps the centres' frame to its own; None if it could not be used.
-        chi2: of the adjustment, per degree of freedom.
+        spheres: the sphere of each of a photograph's outlines (-1: none), for every photograph; an empty array if the
+            photograph could not be used.
+        T_photo_first: the map from the centres' frame to each photograph's own; None if it could not be used.
+        chi2: chi square of the adjustment, per degree of freedom.
     """
 
     centres_m: Array
@@ -58,16 +58,16 @@ class PhotoLayout:
 def layout_from_photographs(
     photographs: Sequence[SpherePhotograph], radius_m: float, prior: LensPrior, expected: int | None = None
 ) -> PhotoLayout:
-    """One layout from photographs of spheres that did not move in between.
+    """Compute one layout from photographs of spheres that did not move in between.
 
     The photograph with the most spheres leads. From a single photograph, depths follow from the outlines' sizes, to
     some tenths of a millimetre at best. With a second viewpoint they follow from the directions, ten times better,
     and the camera is calibrated at the same time.
 
     Args:
-        photographs: from one camera.
+        photographs: photographs taken by one camera.
         radius_m: radius of the spheres.
-        prior: of the camera.
+        prior: prior of the camera's parameters.
         expected: number of spheres; if more are found, those seen in the fewest photographs are dropped.
 
     Raises:
@@ -124,7 +124,7 @@ def _joined(
     radius_m: float,
     prior: LensPrior,
 ) -> tuple[_Group, AdjustedLayout]:
-    """The group with photograph k added by its best-fitting assignment; unchanged if none fits."""
+    """Return the group with photograph k added by its best-fitting assignment; unchanged if none fits."""
     places = places_by_size(photographs[k].cones, radius_m)
     best: tuple[_Group, AdjustedLayout] | None = None
     best_rank = (True, np.inf)
@@ -153,17 +153,17 @@ def _joined(
 
 
 def _without_doubles(joined: _Group, adjusted: AdjustedLayout, known: int, radius_m: float) -> tuple[_Group, Array]:
-    """The group and its centres without spheres of the newest photograph that are known ones.
+    """Drop the newest photograph's spheres that are known ones from the group and its centres.
 
     Spheres are solid: one that lies in a known one is that sphere, or outlined twice, and then none. In the direction
     of a known sphere that the photograph shows nowhere else, the outline is that sphere's, though by its size it is
     nearer or farther.
 
     Args:
-        joined: with the newest photograph last.
+        joined: the group, with the newest photograph last.
         adjusted: the group's layout.
         known: number of spheres before that photograph; its own come behind.
-        radius_m: of the spheres.
+        radius_m: radius of the spheres.
     """
     ids = joined.spheres[-1].copy()
     kept = np.ones(len(adjusted.centres_m), dtype=bool)
@@ -186,7 +186,7 @@ def _without_doubles(joined: _Group, adjusted: AdjustedLayout, known: int, radiu
 
 
 def _nearest_m(centres: Array) -> float:
-    """Least distance between two of the centres (N, 3)."""
+    """Return the least distance between two of the centres (N, 3)."""
     return float(distances(centres)[~np.eye(len(centres), dtype=bool)].min())
 
 
@@ -198,7 +198,7 @@ def _reduced(
     radius_m: float,
     prior: LensPrior,
 ) -> tuple[_Group, AdjustedLayout]:
-    """Without the spheres seen in the fewest photographs, which are other round objects."""
+    """Drop the spheres seen in the fewest photographs, which are other round objects."""
     count = np.bincount(np.concatenate([i[i >= 0] for i in group.spheres]), minlength=len(found.centres_m))
     kept = np.sort(np.argsort(-count, kind="stable")[:expected])
     if count[kept].min() == count[np.setdiff1d(np.arange(len(count)), kept)].max():
@@ -210,14 +210,14 @@ def _reduced(
 
 
 def places_by_size(cones: Sequence[Cone], radius_m: float) -> Array:
-    """(n, 3) centres in the photograph's own frame, with depths from the outlines' sizes."""
+    """Return (n, 3) centres in the photograph's own frame, with depths from the outlines' sizes."""
     return np.array(
         [cone.axis * (radius_m / np.sin(cone.half_angle_rad)) for cone in cones], dtype=np.float64
     ).reshape(-1, 3)
 
 
 def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]]]:
-    """T_a_b and pairs (index in a, index in b) for every way in which b (N, 3) matches a (M, 3), best first.
+    """Return T_a_b and pairs (index in a, index in b) for every way in which b (N, 3) matches a (M, 3), best first.
 
     Nearly symmetric layouts match in more than one way: the adjustment decides between them, and if it cannot, the
     layout is the same either way.
@@ -241,7 +241,7 @@ def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]
 
 
 def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]], Transform, float]:
-    """Pairs within the tolerance, the pose fitted to them, and their sum of squares relative to the tolerance's."""
+    """Return pairs within the tolerance, their fitted pose, and their sum of squares relative to the tolerance's."""
     pairs: list[tuple[int, int]] = []
     cost, T_a_b = float("inf"), start
     for _ in range(2):
@@ -257,7 +257,7 @@ def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]
 
 
 def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
-    """Index triples (M, 3) into a (its largest triangles only) and into b, with equal sides."""
+    """Return index triples (M, 3) into a (its largest triangles only) and into b, with equal sides."""
     da, db = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
     i, j, k = np.array([(p, q, r) for p in range(len(a)) for q in range(p) for r in range(q)]).T
     area = np.linalg.norm(np.cross(a[j] - a[i], a[k] - a[i]), axis=1)
@@ -278,7 +278,7 @@ def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
 
 
 def _rigid(a: Array, b: Array) -> Array:
-    """T_a_b (M, 4, 4) for point triples a, b (M, 3, 3). Source: as `align_points`."""
+    """Return T_a_b (M, 4, 4) for point triples a, b (M, 3, 3). Source: as `align_points`."""
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=1)
     H = np.einsum("mki,mkj->mij", b - mean_b[:, None], a - mean_a[:, None])
     U, _, Vt = np.linalg.svd(H)

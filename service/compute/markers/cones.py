@@ -34,14 +34,14 @@ class Cone:
         return np.array(entries, dtype=np.float64)
 
     def frame(self) -> Array:
-        """(3, 3) with columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
+        """Return (3, 3) with columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
         x, y, z = (float(v) for v in self.axis)
         n = math.sqrt((1 - x * x) ** 2 + (x * y) ** 2 + (x * z) ** 2)
         a, b, c = (1 - x * x) / n, -x * y / n, -x * z / n
         return np.array([[a, y * c - z * b, x], [b, z * a - x * c, y], [c, x * b - y * a, z]])
 
     def rays(self, azimuth_rad: Array, angle_rad: Array) -> Array:
-        """Unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` around it (broadcast)."""
+        """Return the unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` around it (broadcast)."""
         local = np.stack(
             np.broadcast_arrays(
                 np.sin(angle_rad) * np.cos(azimuth_rad), np.sin(angle_rad) * np.sin(azimuth_rad), np.cos(angle_rad)
@@ -52,7 +52,7 @@ class Cone:
 
 
 def cone_of_sphere(centre_camera_m: Array, radius_m: float) -> Cone:
-    """The cone of a sphere with centre (3,) in the camera frame."""
+    """Return the cone of a sphere with centre (3,) in the camera frame."""
     distance = float(np.linalg.norm(centre_camera_m))
     return Cone(centre_camera_m / distance, float(np.arcsin(radius_m / distance)))
 
@@ -67,7 +67,7 @@ class Ellipse:
     angle_rad: float
 
     def equidistant(self, n: int) -> Array:
-        """(n, 2) points at equal arc length, the first one not repeated."""
+        """Return (n, 2) points at equal arc length, the first one not repeated."""
         t = np.linspace(0.0, 2 * np.pi, 1441)
         local = np.stack([self.semi_major * np.cos(t), self.semi_minor * np.sin(t)], axis=1)
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(local, axis=0), axis=1))])
@@ -78,7 +78,7 @@ class Ellipse:
 
 
 def cone_ellipse(cone: Cone) -> Ellipse:
-    """The ellipse in which the cone intersects the plane z = 1; the cone must lie in front of the camera."""
+    """Return the ellipse in which the cone intersects the plane z = 1; the cone must lie in front of the camera."""
     E = cone.conic
     A, b, c = E[:2, :2], E[:2, 2], E[2, 2]
     centre = -np.linalg.solve(A, b).astype(np.float64)
@@ -93,14 +93,14 @@ def cone_ellipse(cone: Cone) -> Ellipse:
 
 
 def angles_to(cone: Cone, rays: Array) -> Array:
-    """Angular distance (N,) of unit rays (N, 3) from the cone's surface, radians, positive outside."""
+    """Return the angular distance (N,) of unit rays (N, 3) from the cone's surface, radians, positive outside."""
     along = rays @ cone.axis
     across = np.linalg.norm(rays - along[:, None] * cone.axis, axis=1)
     return np.arctan2(across, along) - cone.half_angle_rad
 
 
 def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
-    """Weighted least-squares fit of a cone to unit rays (N, 3) by angular (geometric) distance; Gauss–Newton."""
+    """Fit a cone to unit rays (N, 3) by weighted least squares of angular (geometric) distance; Gauss–Newton."""
 
     def step_at(cone: Cone) -> Array:
         local = rays @ cone.frame()
@@ -119,7 +119,7 @@ def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> C
 
 
 def distance_gradient(azimuth_rad: Array) -> Array:
-    """(N, 3) derivative of the angular distance of rays at these azimuths by the axis's shift along frame() and h.
+    """Return (N, 3) derivative of the angular distance of rays at these azimuths by the axis's shift and h.
 
     Tilting the axis by t towards azimuth p reduces the distance of a ray at azimuth q by t cos(p - q).
     """
@@ -127,7 +127,7 @@ def distance_gradient(azimuth_rad: Array) -> Array:
 
 
 def cones_through(triples: Array) -> tuple[Array, Array]:
-    """Cones through triples of unit rays (K, 3, 3): axes (K, 3) and half angles (K,); NaN where degenerate."""
+    """Return cones through triples of unit rays (K, 3, 3): axes (K, 3), half angles (K,); NaN if degenerate."""
     normal = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normal, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,7 +146,7 @@ def ransac_cone(
     rng: np.random.Generator,
     trials: int = 400,
 ) -> tuple[Cone, NDArray[np.bool_]] | None:
-    """RANSAC: the cone on which most edge points agree, and which points (N,) do.
+    """Find the cone on which most edge points agree, by RANSAC, and which points (N,) do.
 
     Args:
         rays: (N, 3) unit rays of edge points.
@@ -211,7 +211,7 @@ class ObservedCones:
 
     @classmethod
     def of(cls, cones: Iterable[Cone]) -> ObservedCones:
-        """With tilts along the first two columns of each cone's `frame()`, as in SphereOutline.cone_covariance."""
+        """Collect cones, with tilts along the first two columns of `frame()`, as in SphereOutline.cone_covariance."""
         found = list(cones)
         return cls(
             np.array([c.axis for c in found], dtype=np.float64).reshape(-1, 3),
@@ -225,15 +225,15 @@ class ObservedCones:
         return cls(axes, half_angles, np.broadcast_to(np.eye(3), (len(axes), 3, 3)))
 
     def __len__(self) -> int:
-        """Number of cones."""
+        """Return the number of cones."""
         return len(self.axes)
 
     def take(self, which: NDArray[np.int64]) -> ObservedCones:
-        """The cones of these indices, which may repeat."""
+        """Return the cones of these indices, which may repeat."""
         return ObservedCones(self.axes[which], self.half_angles[which], self.directions[which])
 
     def residuals(self, centres_camera_m: Array, radius_m: float) -> tuple[Array, Array]:
-        """Residuals (O, K + 1) in radians against spheres, and their derivative (O, K + 1, 3) by the centres.
+        """Return residuals (O, K + 1) in radians against spheres, and derivatives (O, K + 1, 3) by the centres.
 
         Args:
             centres_camera_m: (O, 3) predicted centres in the camera frame.
@@ -257,14 +257,14 @@ class ObservedCones:
 def fit_pose(
     cones: ObservedCones, centres_m: Array, radius_m: float, start: Transform, iterations: int = 12
 ) -> Transform:
-    """T_camera_scan from cones, by robust Gauss–Newton on their directions and sizes.
+    """Return T_camera_scan from cones, by robust Gauss–Newton on their directions and sizes.
 
     Args:
         cones: N ≥ 3.
-        centres_m: (N, 3) of the spheres, scan frame.
+        centres_m: (N, 3) centres of the spheres, scan frame.
         radius_m: radius of the spheres.
         start: initial T_camera_scan.
-        iterations: largest number.
+        iterations: largest number of iterations.
     """
     seen = ObservedCones.with_chords(cones.axes, cones.half_angles)
     try:
@@ -284,7 +284,7 @@ class _InsideSphereError(Exception):
 
 
 def _pose_step(pose: Transform, seen: ObservedCones, centres_m: Array, radius_m: float) -> Array:
-    """One Gauss–Newton step (6,) of translation and rotation. Raises _InsideSphereError."""
+    """Return one Gauss–Newton step (6,) of translation and rotation. Raises _InsideSphereError."""
     rotated = centres_m @ pose[:3, :3].T
     c = rotated + pose[:3, 3]
     if np.any(np.linalg.norm(c, axis=1) < 1.5 * radius_m):

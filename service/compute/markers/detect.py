@@ -57,7 +57,7 @@ _DISTINCT = 0.85  # of the larger radius: a sphere closer behind another is too 
 def detect_spheres(
     image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline, ...]:
-    """Outlines of all spheres in an image (H, W, 3), the most certain first; an empty tuple if there are none.
+    """Find the outlines of all spheres in an image (H, W, 3), the most certain first; empty if there are none.
 
     Everything that looks like a sphere is returned; identity and registration decide which are markers.
 
@@ -76,13 +76,13 @@ def detect_spheres(
 def confirmed_outlines(
     image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[RoughSphere], options: DetectionOptions
 ) -> tuple[SphereOutline, ...]:
-    """The outlines near rough ones that the edges at full resolution confirm, the most certain first.
+    """Return the outlines near rough ones that the edges at full resolution confirm, the most certain first.
 
     Args:
         image_bgr: (H, W, 3), of the camera's size.
         camera: intrinsics.
-        roughs: the best first; of those in one place, the first that is confirmed counts.
-        options: of the detector.
+        roughs: rough spheres, the best first; of those in one place, the first that is confirmed counts.
+        options: the detector's options.
     """
     todo = list(roughs)
     found: list[SphereOutline] = []
@@ -106,7 +106,7 @@ def confirmed_outlines(
 def _refined(
     image: NDArray[np.uint8], camera: CameraModel, roughs: list[RoughSphere], options: DetectionOptions
 ) -> list[SphereOutline]:
-    """The outlines that are confirmed at full resolution."""
+    """Return the outlines that are confirmed at full resolution."""
     kept: list[SphereOutline] = []
     # In a blurred outline, shading can place the rough outline too far inside.
     for factor in _STARTS:
@@ -128,7 +128,7 @@ def _refined(
 def _confirmed(
     image: NDArray[np.uint8], camera: CameraModel, outline: SphereOutline, options: DetectionOptions
 ) -> SphereOutline | None:
-    """The outline, or a better one near it; None if two different outlines explain the edges.
+    """Return the outline, or a better one near it; None if two different outlines explain the edges.
 
     If only parts of an outline are visible, shading or a border beside it can be mistaken for the rest.
     """
@@ -144,7 +144,7 @@ def _confirmed(
 
 
 def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) -> bool:
-    """Whether two outlines of one place are nearly as good but differ by more than their uncertainty."""
+    """Return whether two outlines of one place are nearly as good but differ by more than their uncertainty."""
     tilt = best.cone.frame()[:, :2].T @ (other.cone.axis - best.cone.axis)
     d = np.append(tilt, other.cone.half_angle_rad - best.cone.half_angle_rad)
     chi2 = float(d @ np.linalg.solve(best.cone_covariance + other.cone_covariance, d)) / 3
@@ -152,7 +152,7 @@ def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) 
 
 
 def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions) -> list[RoughSphere]:
-    """Discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
+    """Find the discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
     scale = min(1.0, options.coarse_width_px / camera.width)
     coarse_camera = camera
     coarse = image_bgr
@@ -179,7 +179,7 @@ def _searched(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """The discs among the candidates, of the given colour if any."""
+    """Return the discs among the candidates, of the given colour if any."""
     edge_map = edges(*colour_gradient(coarse))
     rng = np.random.default_rng(options.seed)
     kept: list[RoughSphere] = []
@@ -207,13 +207,13 @@ def _within(direction: Array, cone: Cone) -> bool:
 
 
 def _on(inner: Cone, outer: Cone) -> bool:
-    """Whether a disc lies on a clearly larger one."""
+    """Return whether a disc lies on a clearly larger one."""
     small = inner.half_angle_rad < 0.65 * outer.half_angle_rad
     return small and _within(inner.axis, outer)
 
 
 def _without_overlaps(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Without discs on larger discs, and not too many for one place."""
+    """Drop discs on larger discs, and those that are too many for one place."""
     # Stains and highlights are discs too, but lie on a sphere.
     whole = [r for r in roughs if r.coverage > 0.6 and r.mask_loss < 0.4]
     roughs = [r for r in roughs if not any(_on(r.cone, w.cone) for w in whole)]
@@ -235,7 +235,7 @@ def _of_one_colour(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """The discs of the spheres' colour; doubtful ones only if the colour is given or learnt from clear discs."""
+    """Select the discs of the spheres' colour; doubtful ones only if it is given or learnt from clear discs."""
     if given is not None:
         roughs = [r for r in roughs if share(coarse, camera, r.cone, given) >= _LEAST_SHARE]
     model = _learnt(roughs, options) or given
@@ -257,7 +257,7 @@ def _of_one_colour(
 
 
 def _of_one_size(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Without discs much smaller or larger than the clear ones: equal spheres are at similar distances."""
+    """Drop discs much smaller or larger than the clear ones: equal spheres are at similar distances."""
     clear = [r.cone.half_angle_rad for r in roughs if r.score > CLEAR]
     if len(clear) < _CLEAR_SPHERES:
         return roughs
@@ -285,15 +285,15 @@ class Detector(Protocol):
     def __call__(
         self, image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = ...
     ) -> tuple[SphereOutline, ...]:
-        """The outlines, the most certain first."""
+        """Return the outlines, the most certain first."""
         ...
 
 
 def options_for(colour: str | None, largest: float | None = None) -> DetectionOptions:
-    """Default options with the spheres' colour, by name or as #rrggbb; None: it is learnt from each image.
+    """Return default options with the spheres' colour, by name or as #rrggbb; None: it is learnt from each image.
 
     Args:
-        colour: of the spheres.
+        colour: the spheres' colour.
         largest: largest radius searched for, over the image's width; None: the default.
 
     Raises:

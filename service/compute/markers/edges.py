@@ -59,7 +59,7 @@ def profiles_of(cones: Sequence[Cone], camera: CameraModel, n_azimuths: int, off
 
 
 def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDArray[np.float32]:
-    """Bilinear values (K, J[, C]) at pixels (K, J, 2), at exact positions; cv2.remap would round them to 1/32 px."""
+    """Return bilinear values (K, J[, C]) at exact pixels (K, J, 2); cv2.remap would round them to 1/32 px."""
     h, w = image.shape[:2]
     x = np.clip(pixels[..., 0], 0, w - 1.001)
     y = np.clip(pixels[..., 1], 0, h - 1.001)
@@ -73,7 +73,7 @@ def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDA
 
 
 def sample_sharp(image: Pixels, pixels: Array) -> NDArray[np.uint8] | NDArray[np.float32]:
-    """Values (..., J, 3) at pixels (..., J, 2) by Lanczos interpolation, which does not blur.
+    """Return the values (..., J, 3) at pixels (..., J, 2) by Lanczos interpolation, which does not blur.
 
     Bilinear interpolation averages coded values, which blurs after the transfer curve and moves high-contrast edges
     by a tenth of a pixel. Positions are rounded to 1/32 px, without bias. Values of 16 bits are given in units of
@@ -86,7 +86,7 @@ def sample_sharp(image: Pixels, pixels: Array) -> NDArray[np.uint8] | NDArray[np
 
 
 def sample_averaged(image: Pixels, pixels: Array, count: int) -> NDArray[np.uint8] | NDArray[np.float32]:
-    """Means (..., J, 3) of every `count` neighbouring values along profiles (..., J * count, 2)."""
+    """Return the means (..., J, 3) of every `count` neighbouring values along profiles (..., J * count, 2)."""
     values = _remapped(image, pixels, cv2.INTER_LINEAR)
     means = values.reshape(*values.shape[:-2], -1, count, 3).mean(axis=-2, dtype=np.float32)
     if values.dtype != np.uint8:
@@ -110,7 +110,7 @@ class EdgePoints:
 
 
 def envelope_edges(values: NDArray[np.float32], where: Profiles, peaks_per_ray: int = 3) -> EdgePoints:
-    """The strongest edges of each profile: maxima of any channel's derivative along it.
+    """Return the strongest edges of each profile: maxima of any channel's derivative along it.
 
     `values` (K, J, C) are of an 8-bit image. Strength is relative to the strongest edge of the profile, so a faint
     outline counts fully unless something stronger is beside it.

@@ -50,11 +50,11 @@ class GroundedDetector:
 
     @classmethod
     def of(cls, weights: Weights, least: int, *, vote: bool = False) -> GroundedDetector:
-        """With the weights of a folder; see `load_networks` for the errors raised."""
+        """Load the detector with the weights of a folder; see `load_networks` for the errors raised."""
         return cls(load_networks(weights), least, vote)
 
     def __call__(self, path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-        """The outlines in one image file, the most certain first.
+        """Return the outlines in one image file, the most certain first.
 
         Raises:
             DataError: the file is not an image of the camera's size.
@@ -64,7 +64,7 @@ class GroundedDetector:
     def detect(
         self, image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = DEFAULTS
     ) -> tuple[SphereOutline, ...]:
-        """The outlines in an image (H, W, 3) of the camera's size, the most certain first."""
+        """Detect the outlines in an image (H, W, 3) of the camera's size, the most certain first."""
         boxes = [_widened(box) for box in find_boxes(image_bgr, self.networks, self.least, options)]
         roughs: list[RoughSphere] = []
         for box, mask in zip(boxes, _sphere_masks(image_bgr, boxes, self.networks), strict=True):
@@ -76,7 +76,7 @@ class GroundedDetector:
 
 
 def voted(first: Sequence[SphereOutline], second: Sequence[SphereOutline]) -> tuple[SphereOutline, ...]:
-    """The outlines that both detectors find, and the complete and clear ones of either; the best first."""
+    """Return the outlines that both detectors find, and the complete and clear ones of either; the best first."""
     out = [o for o in first if _shown_by(o, second) or _sure(o)]
     out += [o for o in second if _sure(o) and not _shown_by(o, first)]
     return tuple(sorted(out, key=lambda outline: -outline.score))
@@ -95,14 +95,14 @@ def _sure(outline: SphereOutline) -> bool:
 
 
 def _widened(box: Box) -> Box:
-    """The box with the margin that masks and ellipses expect around a sphere."""
+    """Return the box with the margin that masks and ellipses expect around a sphere."""
     x, y = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
     half = 0.5 * (1 + MARGIN) * max(box[2] - box[0], box[3] - box[1])
     return x - half, y - half, x + half, y + half
 
 
 def _rough(image_bgr: NDArray[np.uint8], camera: CameraModel, ellipse: EllipseEstimate) -> RoughSphere | None:
-    """The cone through an ellipse in pixels; None if the ellipse does not fit its mask or is not an outline."""
+    """Return the cone through an ellipse in pixels; None if it does not fit its mask or is not an outline."""
     if ellipse.loss > MOST_LOSS:
         return None
     t = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False)
@@ -139,7 +139,7 @@ class _Tile:
     bottom: int
 
     def cuts(self, box: Array, width: int, height: int) -> bool:
-        """Whether a box in pixels of the image ends at a border of the tile that is not one of the image."""
+        """Return whether a box in pixels of the image ends at a border of the tile that is not one of the image."""
         x, y = _BORDER * (self.right - self.left), _BORDER * (self.bottom - self.top)
         return bool(
             (self.left > 0 and box[0] < self.left + x)
@@ -152,13 +152,13 @@ class _Tile:
 def find_boxes(
     image_bgr: NDArray[np.uint8], networks: Networks, least: int, options: DetectionOptions = DEFAULTS
 ) -> list[Box]:
-    """Boxes (left, top, right, bottom) in pixels of an image (H, W, 3), the most certain first.
+    """Find boxes (left, top, right, bottom) in pixels of an image (H, W, 3), the most certain first.
 
     The threshold falls from FIRST_THRESHOLD until there are `least` boxes or it is below LAST_THRESHOLD (paper,
     "Sphere Detection").
 
     Args:
-        image_bgr: of any size; larger ones are searched in tiles as well.
+        image_bgr: an image of any size; larger ones are searched in tiles as well.
         networks: Grounding DINO.
         least: spheres expected in the image.
         options: the range of radii, as fractions of the image's width.
@@ -180,7 +180,7 @@ def find_boxes(
 
 
 def _proposals(image_bgr: NDArray[np.uint8], networks: Networks) -> tuple[Array, Array]:
-    """Scores (N,) and boxes (N, 4) of the whole image and its tiles, parts at inner borders left out."""
+    """Return the scores (N,) and boxes (N, 4) of the whole image and its tiles, parts at inner borders left out."""
     height, width = image_bgr.shape[:2]
     scores: list[Array] = [np.zeros(0)]
     boxes: list[Array] = [np.zeros((0, 4))]
@@ -200,7 +200,7 @@ def _proposals(image_bgr: NDArray[np.uint8], networks: Networks) -> tuple[Array,
 
 
 def tiles_of(width: int, height: int, size_px: tuple[int, int]) -> list[_Tile]:
-    """The whole image, and overlapping equal tiles if the network would see it much reduced."""
+    """Return the whole image, and overlapping equal tiles if the network would see it much reduced."""
     reduced = max(min(width, height) / size_px[0], max(width, height) / size_px[1])
     out = [_Tile(0, 0, width, height)]
     if reduced > _MOST_REDUCED:
@@ -211,7 +211,7 @@ def tiles_of(width: int, height: int, size_px: tuple[int, int]) -> list[_Tile]:
 
 
 def _spans(length: int, count: int) -> Iterator[tuple[int, int]]:
-    """`count` equal spans that cover a length and overlap."""
+    """Yield `count` equal spans that cover a length and overlap."""
     side = math.ceil(length / (count - (count - 1) * _OVERLAP)) if count > 1 else length
     for k in range(count):
         start = round(k * (length - side) / max(1, count - 1))
@@ -219,21 +219,21 @@ def _spans(length: int, count: int) -> Iterator[tuple[int, int]]:
 
 
 def _batches(tiles: Sequence[_Tile]) -> Iterator[list[_Tile]]:
-    """The whole image alone, since its size differs; then tiles, several at once."""
+    """Yield the whole image alone, since its size differs; then tiles, several at once."""
     yield [tiles[0]]
     for first in range(1, len(tiles), _TILES_AT_ONCE):
         yield list(tiles[first : first + _TILES_AT_ONCE])
 
 
 def _prepared(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> Floats:
-    """(1, 3, h, w) of a picture as Grounding DINO was trained on them."""
+    """Return (1, 3, h, w) of a picture as Grounding DINO was trained on them."""
     height, width = picture.shape[:2]
     factor = min(size_px[0] / min(height, width), size_px[1] / max(height, width))
     return normalised(picture, (round(factor * width), round(factor * height)))
 
 
 def normalised(picture: NDArray[np.uint8], size: tuple[int, int]) -> Floats:
-    """(1, 3, h, w) RGB of a BGR picture resized to (w, h), with the mean and deviation of the training images."""
+    """Return (1, 3, h, w) RGB of a BGR picture resized to (w, h), with the training images' mean and deviation."""
     larger = size[0] > picture.shape[1]
     resized = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA)
     rgb = np.asarray(resized, dtype=np.float32)[:, :, ::-1] / np.float32(255)
@@ -242,7 +242,7 @@ def normalised(picture: NDArray[np.uint8], size: tuple[int, int]) -> Floats:
 
 
 def _apart(boxes: Array) -> list[Array]:
-    """Of boxes (N, 4), the best first, those that are not on a better one."""
+    """Select from boxes (N, 4), the best first, those that are not on a better one."""
     kept: list[Array] = []
     for box in boxes:
         if all(not _overlap(box, other) for other in kept):
@@ -262,15 +262,15 @@ _PICTURES_AT_ONCE = 6  # pictures given to the network at once: two boxes
 def _sphere_masks(
     image_bgr: NDArray[np.uint8], boxes: Sequence[Box], networks: Networks
 ) -> Iterator[NDArray[np.bool_] | None]:
-    """For each box a (MASK_SIDE, MASK_SIDE) mask of the sphere in its middle; None if there is none.
+    """Yield a (MASK_SIDE, MASK_SIDE) mask of the sphere in each box's middle; None if there is none.
 
-    SAM 2 sees each colour channel as a grey picture and is pointed at its middle; what any channel shows is kept
+    SAM 2 sees each colour channel as a grey picture and is pointed at its middle; the mask has what any channel shows
     (paper, "Sphere Segmentation").
 
     Args:
-        image_bgr: (H, W, 3).
-        boxes: with a margin around the sphere.
-        networks: SAM 2.
+        image_bgr: (H, W, 3) the image.
+        boxes: boxes with a margin around the sphere.
+        networks: the networks of SAM 2.
     """
     size = (networks.side_px, networks.side_px)
     per_batch = _PICTURES_AT_ONCE // 3
@@ -283,7 +283,7 @@ def _sphere_masks(
 
 
 def _joined(logits: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The pixels that at least one of three channels' logits (3, m, m) calls the object, at the masks' size."""
+    """Return pixels that at least one of three channels' logits (3, m, m) calls the object, at the masks' size."""
     size = (MASK_SIDE, MASK_SIDE)
     channels = [cv2.resize(channel, size, interpolation=cv2.INTER_LINEAR) > 0 for channel in logits]
     return np.any(np.array(channels), axis=0).astype(np.uint8)

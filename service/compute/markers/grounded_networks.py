@@ -43,7 +43,7 @@ class Networks:
 
 
 def load_networks(weights: Weights) -> Networks:
-    """Both networks with their weights, on the GPU if there is one; nothing is downloaded.
+    """Load both networks with their weights, on the GPU if there is one; nothing is downloaded.
 
     Raises:
         ConfigurationError: PyTorch or transformers are not installed.
@@ -70,7 +70,7 @@ def load_networks(weights: Weights) -> Networks:
 
 
 def _network(folder: Path, kind: Any) -> Any:
-    """A network of this class with all of its weights; transformers would leave missing ones at random."""
+    """Return a network of this class with all of its weights; transformers would leave missing ones at random."""
     network, loaded = _read(folder, kind, output_loading_info=True)
     if missing := sorted(loaded["missing_keys"]):
         raise DataError(
@@ -82,7 +82,7 @@ def _network(folder: Path, kind: Any) -> Any:
 
 
 def _read(folder: Path, kind: Any, **options: bool) -> Any:
-    """A model or tokenizer of this class from its folder."""
+    """Read a model or tokenizer of this class from its folder."""
     try:
         return kind.from_pretrained(str(folder), local_files_only=True, **options)
     # Damaged weights and configurations raise whatever the parsers of these libraries do.
@@ -127,7 +127,7 @@ def _mask_function(torch: _Torch, segmenter: Any, device: str) -> Callable[[Floa
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """Shorter and longer side, pixels, at which Grounding DINO sees an image."""
+    """Return the shorter and longer side, pixels, at which Grounding DINO sees an image."""
     try:
         size = json.loads(path.read_text("utf-8")).get("size", {})
         return int(size.get("shortest_edge", _SIZE[0])), int(size.get("longest_edge", _SIZE[1]))
@@ -163,12 +163,12 @@ class Weights:
         return self.folder / MASKS
 
     def sha256(self) -> Mapping[str, str]:
-        """The hash of every file that decides what the networks find, by its name within the folder."""
+        """Return the hash of every file that decides what the networks find, by its name within the folder."""
         return {name: _sha256(self.folder / name) for name in _NAMES}
 
 
 def weights_in(folder: Path | None = None) -> Weights:
-    """The weights in a folder; None: in the one that the environment variable ORTHOCAPTURE_GROUNDED names.
+    """Return the weights in a folder; None: in the one that the environment variable ORTHOCAPTURE_GROUNDED names.
 
     Raises:
         ConfigurationError: no folder is named, or files are missing; the remedy says which, and where to put them.

@@ -63,7 +63,7 @@ class ImageSearch:
 class LocatedOutlines:
     """Outlines of all images and how they were found.
 
-    `assignments` tells which outlines are registration spheres; None if every image was searched whole, so that they
+    `assignments` says which outlines are registration spheres; None if every image was searched whole, so that they
     must still be identified. `ImageSearch.missing` numbers the registration spheres first, then the control spheres,
     then others that the anchors show.
     """
@@ -74,7 +74,7 @@ class LocatedOutlines:
     anchors: tuple[int, ...] = ()
 
     def count(self, how: Literal["searched", "predicted"]) -> int:
-        """Number of images whose outlines were found in this way."""
+        """Return the number of images whose outlines were found in this way."""
         return sum(image.how == how for image in self.images)
 
 
@@ -87,7 +87,7 @@ class _Task:
 
 
 def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The outlines in one image file, searched whole.
+    """Detect the outlines in one image file, searched whole.
 
     Raises:
         DataError: the file is missing, truncated, no image or not of the camera's size; `where` names it.
@@ -103,12 +103,12 @@ def detect_all(
     progress: Progress | None = None,
     detect: DetectFile | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
-    """The outlines in all images, in the given order, every image searched whole.
+    """Detect the outlines in all images, in the given order, every image searched whole.
 
     Args:
         image_paths: JPEG, PNG or TIFF files of the camera's size.
         camera: intrinsics.
-        options: of the detector.
+        options: the detector's options.
         workers: number of processes; 1 computes in this one.
         progress: called with (done, total) after each image.
         detect: another detector for one file, which must be picklable; None: `detect_file`.
@@ -137,7 +137,7 @@ def locate_outlines(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> LocatedOutlines:
-    """The outlines in all images, searched only where the poses predict spheres.
+    """Detect the outlines in all images, searched only where the poses predict spheres.
 
     A few images of each station, spread over its poses, are searched whole at reduced size. Their identification and
     a provisional registration predict every sphere in every image, and how far the poses may be off. An image with
@@ -150,7 +150,7 @@ def locate_outlines(
         spheres: registration and control spheres.
         scenes: (N,) images of the same number show the same spheres; between numbers, spheres that are in no list may
             have come or gone. None: all the same.
-        options: of the detector.
+        options: the detector's options.
         workers: number of processes; 1 computes in this one.
         progress: called with (done, total) after each image.
 
@@ -185,7 +185,7 @@ def locate_outlines(
 def _located(
     found: Sequence[ImageOutlines], first: AnchorRegistration, camera: CameraModel, spheres: ScanSpheres
 ) -> LocatedOutlines:
-    """What was found at the predicted places, with the registration spheres identified."""
+    """Combine the outlines found at the predicted places, with the registration spheres identified."""
     centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
     assignments: list[Assignment] = []
     for f, T in zip(found, first.T_scan_camera, strict=True):
@@ -215,7 +215,7 @@ def search_nearby(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
-    """The outlines around expected spheres of image files, as `find_nearby` finds them in each.
+    """Search image files for outlines around expected spheres, as `find_nearby` finds them in each.
 
     Raises:
         DataError: an image cannot be used; the message names the first one.
@@ -233,7 +233,7 @@ def _nearby(
 
 
 def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutlines:
-    """`LocatedOutlines` for images searched whole, as by `detect_all`."""
+    """Return `LocatedOutlines` for images searched whole, as by `detect_all`."""
     return LocatedOutlines(tuple(outlines), None, tuple(ImageSearch("searched") for _ in outlines))
 
 
@@ -243,7 +243,7 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageO
 
 @contextmanager
 def _mapping(workers: int, items: int) -> Generator[MapFunction]:
-    """A map over processes, or the plain one for a single worker."""
+    """Provide a map over processes, or the plain one for a single worker."""
     if workers <= 1 or items <= 1:
         yield map
         return
@@ -275,17 +275,17 @@ class MapFunction(Protocol):
     """`map`, in this process or over several."""
 
     def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
-        """The results of `work` on the items, in their order."""
+        """Return the results of `work` on the items, in their order."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class AnchorRegistration:
-    """The provisional registration.
+    """The provisional registration by a few images, the anchors.
 
     Attributes:
-        T_scan_camera: (N, 4, 4).
-        scale: of the poses' positions.
+        T_scan_camera: (N, 4, 4) provisional camera poses in the scan frame.
+        scale: scale of the poses' positions.
         margin: largest expected displacement of a sphere from its predicted place, in radii.
         tone: brightness of the spheres.
         unlisted_m: (U, 3) spheres in no list, scan frame.
@@ -308,7 +308,7 @@ def _register_anchors(
     options: DetectionOptions,
     map_over: MapFunction,
 ) -> AnchorRegistration | None:
-    """The registration of a few images of each of the `sets`; None if no reliable one is found."""
+    """Return the registration of a few images of each of the `sets`; None if no reliable one is found."""
     seen: dict[int, tuple[SphereOutline, ...]] = {}
     look = partial(_look_reduced, camera=images.camera, options=options)
     nothing: tuple[SphereOutline, ...] = ()
@@ -357,7 +357,7 @@ def _provisional(
 
 
 def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The clearest outlines of an anchor; identification needs only some, so doubtful ones are dropped."""
+    """Return the clearest outlines of an anchor; identification needs only some, so doubtful ones are dropped."""
     image, smaller = read_reduced(path, camera, ANCHOR_WIDTH_PX)
     few = dataclasses.replace(options, max_candidates=min(_ANCHOR_CANDIDATES, options.max_candidates))
     roughs = find_rough(image, smaller, few)
@@ -407,7 +407,7 @@ def _unlisted(
     spheres: Array,
     radius_m: float,
 ) -> Array:
-    """(U, 3) spheres in no list that two anchors show at one place."""
+    """Return (U, 3) spheres in no list that two anchors show at one place."""
     rays: list[tuple[int, Array, Array, float]] = []  # image, origin, direction, half angle
     for i, found in enumerate(outlines):
         T = T_scan_camera[i]

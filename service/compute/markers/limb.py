@@ -30,11 +30,11 @@ class LimbProfiles:
     """Values along K profiles across each of G outlines, lengths in the unit of the offsets.
 
     Attributes:
-        coded_bgr: (G, K, J, 3).
+        coded_bgr: (G, K, J, 3) values along the profiles.
         offsets: (J,) positions across the outline, evenly spaced, positive outside.
-        inside: (G, K) whether a profile lies in the image.
-        radius: (G,) of the outlines.
-        srgb: whether values are sRGB coded.
+        inside: (G, K) true if a profile lies in the image.
+        radius: (G,) radius of the outlines.
+        srgb: true if values are sRGB coded.
     """
 
     coded_bgr: Coded
@@ -46,16 +46,16 @@ class LimbProfiles:
 
 @dataclass(frozen=True, slots=True)
 class LimbModel:
-    """What the forward model is evaluated on.
+    """The data on which the forward model is evaluated.
 
     Attributes:
         data: (G, 3, K, J) Y, Cb, Cr of the profiles.
         t: (J,) offsets.
         wide: (J',) offsets with margins for the blur.
         sharp: (J', J) interpolation from `wide` to `t`.
-        radius: (G,) of the outlines.
+        radius: (G,) radius of the outlines.
         tone: (G, 3) the spheres' colour in linear light.
-        srgb: whether values are sRGB coded.
+        srgb: true if values are sRGB coded.
     """
 
     data: Array32
@@ -68,7 +68,7 @@ class LimbModel:
 
     @classmethod
     def of(cls, profiles: LimbProfiles, tone: Array32) -> LimbModel:
-        """The model of these profiles of spheres with these colours."""
+        """Return the model of these profiles of spheres with these colours."""
         t = profiles.offsets
         step = float(t[1] - t[0])
         margin = int(np.ceil(3.6 / step)) if step < 0.8 else 3
@@ -79,7 +79,7 @@ class LimbModel:
 
 @lru_cache(maxsize=1)
 def _limb_table() -> tuple[Array32, Array32]:
-    """E[sqrt(max(0, -(x + z)))] for z ~ N(0, 1), and its derivative, at _TABLE."""
+    """Return E[sqrt(max(0, -(x + z)))] for z ~ N(0, 1), and its derivative, at _TABLE."""
     z = np.linspace(-6, 6, 2401)
     weight = np.exp(-0.5 * z**2)
     weight /= weight.sum()
@@ -89,14 +89,14 @@ def _limb_table() -> tuple[Array32, Array32]:
 
 @lru_cache(maxsize=2)
 def light_of(*, srgb: bool) -> Array32:
-    """(256,) linear light of each coded value."""
+    """Return (256,) linear light of each coded value."""
     x = np.arange(256) / 255
     linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4) if srgb else x
     return linear.astype(np.float32)
 
 
 def _to_light(coded: Coded, *, srgb: bool) -> Array32:
-    """Linear light of coded values."""
+    """Return linear light of coded values."""
     if coded.dtype == np.uint8:
         return light_of(srgb=srgb)[coded.astype(np.uint8, copy=False)]
     x = coded / np.float32(255)
@@ -105,7 +105,7 @@ def _to_light(coded: Coded, *, srgb: bool) -> Array32:
 
 
 def _coded(linear: Array32, *, srgb: bool) -> tuple[Array32, Array32]:
-    """Coded values of linear light, and their derivative."""
+    """Return the coded values of linear light, and their derivative."""
     if not srgb:
         return linear, np.ones_like(linear)
     x = np.maximum(linear, np.float32(1e-5))
@@ -116,7 +116,7 @@ def _coded(linear: Array32, *, srgb: bool) -> tuple[Array32, Array32]:
 
 
 def _smoothing(t: Array, wide: Array, blur: Array) -> tuple[Array32, Array32]:
-    """(G, J', J) matrices that blur values at `wide` by Gaussians (G,) and sample at `t`, and their derivative."""
+    """Return matrices (G, J', J) that blur values at `wide` by Gaussians (G,) and sample at `t`, and derivatives."""
     s = blur[:, None, None]
     square = (t - wide[:, None]) ** 2
     weight = np.exp(-0.5 * square / s**2)
@@ -127,7 +127,7 @@ def _smoothing(t: Array, wide: Array, blur: Array) -> tuple[Array32, Array32]:
 
 
 def _interpolation(t: Array, wide: Array) -> Array32:
-    """(J', J) mean effect of Lanczos interpolation on a profile, averaged over sub-pixel positions.
+    """Return (J', J) mean effect of Lanczos interpolation on a profile, averaged over sub-pixel positions.
 
     The kernel is stretched to the mean over directions: along the pixels' diagonal it is narrower.
     """
@@ -137,7 +137,7 @@ def _interpolation(t: Array, wide: Array) -> Array32:
 
 
 def _mixed(channels: Array32) -> Array32:
-    """Y, Cb, Cr of channels (G, 3, K, J)."""
+    """Return Y, Cb, Cr of channels (G, 3, K, J)."""
     return (_MIX @ channels.reshape(*channels.shape[:2], -1)).reshape(channels.shape)
 
 
@@ -146,9 +146,9 @@ class _BeforeBlur:
     """The model before interpolation and the colours' blur.
 
     Attributes:
-        mixed: (G, 3, 6, K, J') of Y, Cb, Cr: derivatives by limb, inner and outer slope, offset and blur; the value.
-        slope: (G, 3, K, J') of the coded values by linear light, of B, G, R.
-        share: (G, K, J') of the sphere in each sample.
+        mixed: (G, 3, 6, K, J') Y, Cb, Cr: derivatives by limb, inner and outer slope, offset and blur; the value.
+        slope: (G, 3, K, J') derivative of the coded values by linear light, for B, G, R.
+        share: (G, K, J') share of the sphere in each sample.
     """
 
     mixed: Array32
@@ -195,11 +195,11 @@ def _shown(p: Array, blur: Array, model: LimbModel) -> _BeforeBlur:
 
 
 def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32, Array32]:
-    """The blurred light of a sphere towards its limb, and its derivative by the offset, without its sign.
+    """Return the blurred light of a sphere towards its limb, and its derivative by the offset, without its sign.
 
     Args:
         u: (G, K, J') distances from the edge, positive outside.
-        x: the same in standard deviations of the blur, within ± 12.
+        x: the distance in standard deviations of the blur, within ± 12.
         s: (G, 1, 1) standard deviations of the blur.
         R: (G, 1, 1) radii of the outlines.
     """
@@ -215,7 +215,7 @@ def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32
 
 
 def evaluate(p: Array, blur: Array, chroma_blur: Array, model: LimbModel) -> tuple[Array32, Array32]:
-    """Jacobian and, last, residual (G, 13, 3, K, J) of the model in Y, Cb, Cr; the sphere's share (G, K, J)."""
+    """Return the model's Jacobian and, last, residual (G, 13, 3, K, J) in Y, Cb, Cr; the sphere's share (G, K, J)."""
     shown = _shown(p, blur, model)
     mixed, S, sharp = shown.mixed, shown.share, model.sharp
     G, K, wider = S.shape
@@ -265,7 +265,7 @@ class LimbFit:
 
 
 def masked_median(values: Array | Array32, mask: Mask) -> Array:
-    """Medians along the last axis of the values selected by the mask; infinite if there are none."""
+    """Return the medians along the last axis of the values selected by the mask; infinite if there are none."""
     ordered = np.sort(np.where(mask, values, np.inf), axis=-1)
     count = np.broadcast_to(mask, values.shape).sum(axis=-1, keepdims=True)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
@@ -276,7 +276,7 @@ def masked_median(values: Array | Array32, mask: Mask) -> Array:
 def fit_limb(
     profiles: LimbProfiles, *, blur: Array, chroma_blur: Array, iterations: int = 4, reach: float = 2.0
 ) -> LimbFit:
-    """Edges by Gauss–Newton on the forward model, with one blur for all profiles of an outline.
+    """Return the edges by Gauss–Newton on the forward model, with one blur for all profiles of an outline.
 
     Lengths are in one unit: the image's pixel, or the step over which samples were averaged. The loop is its own and
     has a fixed number of steps: before each, noise, selection of profiles and priors are estimated again, so there is
@@ -287,7 +287,7 @@ def fit_limb(
         blur: (G,) initial standard deviation of lens and pixel.
         chroma_blur: (G,) initial extra standard deviation of the colour differences; about 1.1 for 4:2:0.
         iterations: number of Gauss–Newton steps.
-        reach: largest offset.
+        reach: largest offset of an edge.
     """
     inside = profiles.inside
     usable = np.where(inside.any(axis=1, keepdims=True), inside, True)
@@ -322,7 +322,7 @@ def fit_limb(
 
 @dataclass(frozen=True, slots=True)
 class _Shading:
-    """What is known about the profiles' shading: the limb's rise is similar all around, and slopes are small.
+    """The prior of the profiles' shading: the limb's rise is similar all around, and slopes are small.
 
     Values are (G, K), and how far a profile may deviate is (G, 1).
     """
@@ -333,7 +333,7 @@ class _Shading:
     slope_sigma: Array
 
     def priors(self) -> tuple[tuple[int, Array | float, Array | float], ...]:
-        """(index, value, sigma) of these and of the profiles' other parameters with a prior."""
+        """Return (index, value, sigma) of these and of the profiles' other parameters with a prior."""
         return (
             (LIMB, self.limb, self.limb_sigma),
             (SLOPE, self.slope, self.slope_sigma),
@@ -342,7 +342,7 @@ class _Shading:
         )
 
     def renewed(self, p: Array, good: Mask) -> _Shading:
-        """The shading seen in the profiles' parameters; the former one for outlines with few good profiles."""
+        """Return the shading seen in the profiles' parameters; the former one for outlines with few good profiles."""
         enough = good.sum(axis=1, keepdims=True) > 16
         seen = (*_around(p[..., LIMB], good, 0.02), *_around(p[..., SLOPE], good, 0.1))
         before = (self.limb, self.limb_sigma, self.slope, self.slope_sigma)
@@ -350,7 +350,7 @@ class _Shading:
 
 
 def _products(rows: Array32, share: Array32, inside: Array, outside: Array) -> Array:
-    """Products (G, K, 13, 13) of the rows, weighted by their standard deviations (G, 3) on both sides of the edge.
+    """Return products (G, K, 13, 13) of the rows, weighted by standard deviations (G, 3) on both sides of the edge.
 
     `rows` (G, 13, 3, K, J) are weighted in place, and (G, K, J) is the sphere's `share` in each sample.
     """
@@ -362,7 +362,7 @@ def _products(rows: Array32, share: Array32, inside: Array, outside: Array) -> A
 
 
 def _moved(p: Array, delta: Array, reach: float) -> Array:
-    """The profiles' parameters after a step, within their limits."""
+    """Return the profiles' parameters after a step, within their limits."""
     delta[..., OFFSET] = np.clip(delta[..., OFFSET], -0.7, 0.7)
     p = p + delta
     p[..., OFFSET] = np.clip(p[..., OFFSET], -reach, reach)
@@ -374,7 +374,7 @@ def _moved(p: Array, delta: Array, reach: float) -> Array:
 def _gauss_newton(
     normal: Array, p: Array, priors: tuple[tuple[int, Array | float, Array | float], ...], good: Mask
 ) -> tuple[Array, Array, Array]:
-    """Steps of the profiles' own (G, K, 10) and of the outlines' (G, 2) parameters, and the offset's formal variance.
+    """Return steps of the profiles' (G, K, 10) and outlines' (G, 2) parameters, and the offset's formal variance.
 
     `normal` (G, K, 13, 13) holds the weighted products of the Jacobian's columns and, last, the residual. The
     profiles' own parameters are eliminated; `priors` are (index, value, sigma); `good` selects the profiles used for
@@ -401,7 +401,7 @@ def _gauss_newton(
 
 
 def _around(values: Array, good: Mask, least: float) -> tuple[Array, Array]:
-    """A shading term averaged over the neighbourhood (G, K), and how far single profiles may deviate (G, 1).
+    """Return a shading term averaged over the neighbourhood (G, K), and how far single profiles may deviate (G, 1).
 
     A running median over a twelfth of the outline preserves the jump where the light's terminator meets the limb.
     """
@@ -417,7 +417,7 @@ def _around(values: Array, good: Mask, least: float) -> tuple[Array, Array]:
 
 
 def _albedo(profiles: LimbProfiles, usable: Mask) -> Array32:
-    """(G, 3) the spheres' colour in linear light, of unit luma, measured away from the edges."""
+    """Return (G, 3) the spheres' colour in linear light, of unit luma, measured away from the edges."""
     t = profiles.offsets
     inner = np.moveaxis(profiles.coded_bgr[:, :, t < t[0] + 2.1], 3, 1)  # (G, 3, K, n)
     mask = np.broadcast_to(usable[:, None, :, None], inner.shape)
@@ -435,7 +435,7 @@ def _start(profiles: LimbProfiles) -> Array:
 
 
 def _scales(r: Array32, share: Array32, usable: Mask) -> tuple[Array, Array]:
-    """Robust standard deviations (G, 3) of the residuals inside and outside the sphere."""
+    """Return the robust standard deviations (G, 3) of the residuals inside and outside the sphere."""
     size = np.abs(r).reshape(*r.shape[:2], -1)
     out: list[Array] = []
     for side in (share > 0.9, share < 0.1):

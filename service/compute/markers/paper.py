@@ -60,17 +60,17 @@ def detect_by_masks(
     options: DetectionOptions = DEFAULTS,
     boxes: Sequence[Box] | None = None,
 ) -> tuple[SphereOutline, ...]:
-    """Outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"), the best first.
+    """Detect outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"), the best first.
 
     Boxes and masks replace Grounding DINO and SAM 2: boxes come from circle votes unless given, masks from GrabCut on
-    each channel, started at the middle. Kept for comparison with the default detector; its edge points lie on whole
-    pixels of one grey image.
+    each channel, started at the middle. It serves for comparison with the default detector; its edge points lie on
+    whole pixels of one grey image.
 
     Args:
-        image_bgr: at the camera's size.
-        camera: used to undistort points before the conic is fitted.
+        image_bgr: an image of the camera's size.
+        camera: the camera by which points are undistorted before the conic is fitted.
         options: radii, coverage and number of points are used.
-        boxes: from another detector; None: found here.
+        boxes: boxes of another detector; None: they are found here.
     """
     found: list[SphereOutline] = []
     for box in find_boxes(image_bgr, options) if boxes is None else boxes:
@@ -89,7 +89,7 @@ def detect_by_masks(
 
 
 def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULTS) -> list[Box]:
-    """Boxes around what may be a sphere, the most certain first."""
+    """Find the boxes around what may be a sphere, the most certain first."""
     scale = min(1.0, options.coarse_width_px / image_bgr.shape[1])
     small = image_bgr
     if scale < 1:
@@ -107,9 +107,9 @@ def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULT
 
 
 def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | None:
-    """(side, side) mask of the sphere in the middle of the reduced box; None if there is none.
+    """Return a (side, side) mask of the sphere in the middle of the reduced box; None if there is none.
 
-    The masks of the channels are joined, opened and closed, and the component that contains the middle is kept. The
+    The masks of the channels are joined, opened and closed, and the component that contains the middle is used. The
     middle is assumed to be sphere and the box's corners background; GrabCut decides the rest.
     """
     patch = cv2.resize(cut(image_bgr, box), (MASK_SIDE, MASK_SIDE), interpolation=cv2.INTER_AREA)
@@ -134,7 +134,7 @@ def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | N
 
 
 def in_the_middle(joined: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """The component at the middle of a (side, side) mask, which is opened and closed first; None if there is none."""
+    """Return the component at the middle of a (side, side) mask, opened and closed first; None if there is none."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     smooth = np.asarray(cv2.morphologyEx(cv2.morphologyEx(joined, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel))
     _, parts = cv2.connectedComponents(smooth.astype(np.uint8))
@@ -143,7 +143,7 @@ def in_the_middle(joined: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
 
 
 def cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
-    """The box cropped from the image; beyond the image, its border is repeated."""
+    """Return the box cropped from the image; beyond the image, its border is repeated."""
     height, width = image_bgr.shape[:2]
     rows = np.clip(np.arange(round(box[1]), round(box[3])), 0, height - 1)
     columns = np.clip(np.arange(round(box[0]), round(box[2])), 0, width - 1)
@@ -151,7 +151,7 @@ def cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
 
 
 def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
-    """The ellipse with the fewest false positives and negatives against a mask, from several starts."""
+    """Return the ellipse with the fewest false positives and negatives against a mask, from several starts."""
     side = len(mask)
     rows, columns = np.mgrid[0:side, 0:side].astype(np.float64)
     inside = mask.astype(np.float64)
@@ -184,7 +184,7 @@ def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
 
 
 def middle_colour(image_bgr: NDArray[np.uint8], ellipse: EllipseEstimate) -> tuple[float, float, float]:
-    """The median colour (blue, green, red; 0..255) of an ellipse's middle; black if that is outside the image."""
+    """Return the median colour (blue, green, red; 0..255) of an ellipse's middle; black outside the image."""
     reach = max(2, round(0.4 * min(ellipse.a, ellipse.b)))
     u, v = round(ellipse.x), round(ellipse.y)
     middle = image_bgr[max(0, v - reach) : max(0, v + reach), max(0, u - reach) : max(0, u + reach)]
@@ -197,7 +197,7 @@ def middle_colour(image_bgr: NDArray[np.uint8], ellipse: EllipseEstimate) -> tup
 def _outline(
     image_bgr: NDArray[np.uint8], camera: CameraModel, estimate: EllipseEstimate, options: DetectionOptions
 ) -> SphereOutline | None:
-    """The outline by Canny points in the ellipse's envelope, undistorted and fitted by RANSAC."""
+    """Return the outline by Canny points in the ellipse's envelope, undistorted and fitted by RANSAC."""
     radius = 0.5 * (estimate.a + estimate.b)
     reach = max(3.0, _ENVELOPE * radius)
     half = max(estimate.a, estimate.b) + reach + 4
@@ -276,12 +276,12 @@ def detect_file_by_masks(
     options: DetectionOptions = DEFAULTS,
     boxes: Mapping[str, Sequence[Box]] | None = None,
 ) -> tuple[SphereOutline, ...]:
-    """The outlines in one image file by the paper's chain.
+    """Detect the outlines in one image file by the paper's chain.
 
     Args:
         path: JPEG, PNG or TIFF of the camera's size.
         camera: intrinsics.
-        options: of the detector.
+        options: the detector's options.
         boxes: (left, top, right, bottom) in pixels by file name; an image without an entry has no sphere. None: found
             by circle votes.
 
@@ -293,10 +293,10 @@ def detect_file_by_masks(
 
 
 def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
-    """Boxes by image name from a JSON file, such as Grounding DINO's.
+    """Read the boxes by image name from a JSON file, such as Grounding DINO's.
 
     Raises:
-        DataError: the file is not JSON of this form, a box has no area, or an image is not among `names`.
+        DataError: the file is not JSON of this format, a box has no area, or an image is not among `names`.
     """
     data = parse_json(file_text(path), name=str(path), remedy=_FORM)
     if not isinstance(data, dict):

@@ -42,13 +42,13 @@ class Tone:
     reach: float
 
     def admits(self, outline: SphereOutline) -> bool:
-        """Whether the outline's colour may be a marker's."""
+        """Return whether the outline's colour may be a marker's."""
         a, b = _chromaticity([outline])[0]
         return bool(np.hypot(a - self.a, b - self.b) <= self.reach)
 
 
 def tone_of(outlines: Sequence[SphereOutline]) -> Tone:
-    """The common colour of one or more outlines."""
+    """Return the common colour of one or more outlines."""
     tones = _chromaticity(outlines)
     middle = np.median(tones, axis=0)
     spread = float(np.median(np.linalg.norm(tones - middle, axis=1)))
@@ -76,7 +76,7 @@ class PredictedSpheres:
     voting: int | None = None
 
     def votes(self, sphere: int) -> bool:
-        """Whether a sphere takes part in choosing outlines."""
+        """Return whether a sphere takes part in choosing outlines."""
         return self.voting is None or sphere < self.voting
 
 
@@ -91,7 +91,7 @@ class PredictedOutlines:
 
     @property
     def convincing(self) -> bool:
-        """Whether so many voting spheres were found where predicted that the prediction must be right."""
+        """True if so many voting spheres were found where predicted that the prediction must be right."""
         found, lacking = (
             sum(self.voting is None or m < self.voting for m in part) for part in (self.outlines, self.missing)
         )
@@ -134,7 +134,7 @@ def locate_predicted(
     expected: PredictedSpheres,
     options: DetectionOptions = DEFAULTS,
 ) -> PredictedOutlines:
-    """The outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
+    """Locate the outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
 
     Each region is searched as far as the prediction may be off. The outlines found must agree with one camera pose
     (the image's own, so the robot's pose may be off) in place, size and colour; spheres that do not are reported as
@@ -192,7 +192,7 @@ def _starts(
     pose: Transform,
     options: DetectionOptions,
 ) -> dict[int, AveragedCone] | None:
-    """Cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
+    """Return cones good to about a pixel for measurement: approached ones, and predictions by these for the others.
 
     None if the approached spheres do not agree on a pose.
     """
@@ -214,13 +214,13 @@ def _starts(
 
 
 def _within_gate(cone: Cone, predicted: Cone, part: float = 1.0) -> bool:
-    """Whether a cone, of which a part 0 … 1 of the outline is visible, is where the other spheres predict it."""
+    """Return whether a cone is where the other spheres predict it; a part 0 … 1 of its outline is visible."""
     place, size = deviation(cone, predicted)
     return place <= _GATE.place / part and size <= _GATE.size / part
 
 
 def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
-    """Distance of the centres in radii, and relative difference of the sizes."""
+    """Return the distance of the centres in radii, and relative difference of the sizes."""
     apart = float(np.linalg.norm(cone.axis - predicted.axis))  # of unit vectors: equals a small angle
     half = predicted.half_angle_rad
     return apart / half, abs(cone.half_angle_rad / half - 1.0)
@@ -234,7 +234,7 @@ def visible_cones(
     *,
     least: float = _LEAST_PART,
 ) -> dict[int, Cone]:
-    """Cones of the spheres of whose outline the `least` share is in the image and not behind another sphere."""
+    """Return cones of spheres with the `least` share of their outline in the image and not behind another sphere."""
     centres = apply(T_camera_scan, centres_scan_m)
     distance = np.linalg.norm(centres, axis=1)
     cones = {
@@ -263,7 +263,7 @@ def visible_cones(
 
 
 def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin: float) -> Cone | None:
-    """The circle near a predicted one, searched in its region at reduced size."""
+    """Return the circle near a predicted one, searched in its region at reduced size."""
     shrink = max(1.0, cone.half_angle_rad * camera.fx / _REGION_RADIUS_PX)
     angle = cone.half_angle_rad * (1.15 + margin)
     rim = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, angle)))
@@ -306,7 +306,7 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
 def _approached_pose(
     image: NDArray[np.uint8], camera: CameraModel, expected: PredictedSpheres, shown: dict[int, Cone]
 ) -> Transform:
-    """The image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
+    """Compute the image's pose from circles near predicted ones: from a few spheres, or all if those disagree."""
     order = _spread({m: cone for m, cone in shown.items() if expected.votes(m)})
     roughs: dict[int, Cone] = {}
     for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):
@@ -322,7 +322,7 @@ def _approached_pose(
 
 
 def _spread(cones: dict[int, Cone]) -> list[int]:
-    """The spheres in an order in which each is as far as possible from those before it."""
+    """Return the spheres in an order in which each is as far as possible from those before it."""
     if not cones:
         return []
     names = list(cones)
@@ -339,7 +339,7 @@ def _spread(cones: dict[int, Cone]) -> list[int]:
 def _agreed_pose(
     cones: dict[int, Cone], expected: PredictedSpheres, start: Transform, gate: float, least: float
 ) -> Transform | None:
-    """T_camera_scan on which `least` cones (at least three) agree; None if they do not."""
+    """Return T_camera_scan on which `least` cones (at least three) agree; None if they do not."""
     if len(cones) < _POSE_SPHERES:
         return None
     index = list(cones)
@@ -362,13 +362,13 @@ def find_nearby(
     expected: Sequence[tuple[Cone, float]],
     options: DetectionOptions = DEFAULTS,
 ) -> tuple[SphereOutline, ...]:
-    """Outlines of spheres around expected ones in an image (H, W, 3), which may be others than those expected.
+    """Find outlines of spheres around expected ones in an image (H, W, 3); they may be others than those expected.
 
     Args:
-        image_bgr: of the camera's size.
+        image_bgr: an image of the camera's size.
         camera: intrinsics.
         expected: cones of the expected spheres, and the angle (rad) by which each may be elsewhere.
-        options: of the detector.
+        options: the detector's options.
     """
     found: list[SphereOutline] = []
     for cone, window_rad in expected:
@@ -379,7 +379,7 @@ def find_nearby(
 
 
 def is_another(outline: SphereOutline, known: Sequence[SphereOutline]) -> bool:
-    """Whether an outline is of another sphere than each of those that are known in the same image."""
+    """Return whether an outline is of another sphere than each of those that are known in the same image."""
     apart = (float(np.linalg.norm(outline.cone.axis - other.cone.axis)) for other in known)
     return all(gap > _SAME * outline.cone.half_angle_rad for gap in apart)
 

@@ -100,16 +100,16 @@ class SphereOutline(OutlineEvidence):
         return self.cone.conic
 
     def captured_px(self, camera: CameraModel) -> Array:
-        """(L, 2) points of the outline in pixels of the image as captured (with distortion)."""
+        """Return (L, 2) points of the outline in pixels of the image as captured (with distortion)."""
         return camera.project(np.column_stack([self.points, np.ones(len(self.points))]))
 
     def centre_camera_m(self, radius_m: float) -> Array:
-        """(3,) position of the centre of a sphere of this radius in the camera frame."""
+        """Return (3,) position of the centre of a sphere of this radius in the camera frame."""
         return self.cone.axis * (radius_m / np.sin(self.cone.half_angle_rad))
 
 
 def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: OutlineEvidence) -> SphereOutline:
-    """The outline of a cone, which has `n_points` equidistant points."""
+    """Return the outline of a cone, which has `n_points` equidistant points."""
     ellipse = cone_ellipse(cone)
     centre = camera.project(np.array([[*ellipse.centre, 1.0]]))[0]
     f = 0.5 * (camera.fx + camera.fy)
@@ -126,7 +126,7 @@ def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: 
 
 
 def outline_record(outline: SphereOutline) -> dict[str, Any]:
-    """An outline as JSON-compatible data."""
+    """Return an outline as JSON-compatible data."""
     record: dict[str, Any] = {name: getattr(outline, name) for name in _EVIDENCE}
     record["cone_covariance"] = outline.cone_covariance.tolist()
     record["axis"] = outline.cone.axis.tolist()
@@ -177,7 +177,7 @@ class ColourModel:
     palest: float = 1.0  # least saturation over that of `middle`; below 1, the hue decides, not the saturation
 
     def distance(self, colours_bgr: Array) -> Array:
-        """(N,) distance of colours (N, 3) in tolerances; up to 1 is a sphere's colour."""
+        """Return (N,) distance of colours (N, 3) in tolerances; up to 1 is a sphere's colour."""
         tones = chromaticity(colours_bgr, srgb=self.srgb)
         if self.palest == 1.0:
             return np.linalg.norm(tones - self.middle, axis=1) / self.tolerance
@@ -187,7 +187,7 @@ class ColourModel:
         return np.asarray(np.where(np.hypot(along, across) < self.palest, 9.0, off), dtype=np.float64)
 
     def paler(self) -> ColourModel | None:
-        """The model for pale pictures of cheap cameras, by its hue; None if the colour has hardly any saturation."""
+        """Return the model for cheap cameras' pale pictures, by its hue; None if the colour is hardly saturated."""
         pale = float(np.linalg.norm(self.middle)) > 2 * self.tolerance
         return replace(self, palest=_PALEST) if pale else None
 
@@ -198,7 +198,7 @@ def _axes(unit: Array) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def colour_of(text: str) -> tuple[Colour, float]:
-    """A colour and its chromaticity tolerance from a name (white, grey, green, orange) or #rrggbb.
+    """Return a colour and its chromaticity tolerance from a name (white, grey, green, orange) or #rrggbb.
 
     Raises:
         ConfigurationError: neither a known name nor #rrggbb.
@@ -215,13 +215,13 @@ def colour_of(text: str) -> tuple[Colour, float]:
 
 
 def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *, srgb: bool) -> ColourModel | None:
-    """The colour that most of the discs share, since all spheres have one colour; None if too few agree.
+    """Learn the colour that most of the discs share, since all spheres have one colour; None if too few agree.
 
     Args:
         colours_bgr: (N, 3) median colours of discs.
-        weights: (N,) how much each looks like a sphere.
+        weights: (N,) likeness of each to a sphere.
         clear: (N,) discs that pass every test by themselves; at least one must have the colour.
-        srgb: whether the values are sRGB coded.
+        srgb: true if the values are sRGB coded.
     """
     if len(colours_bgr) < _MEMBERS:
         return None
@@ -237,12 +237,12 @@ def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *
 
 
 def given_colour(colour_bgr: Colour, tolerance: float, *, srgb: bool) -> ColourModel:
-    """The model of a colour known in advance."""
+    """Return the model of a colour known in advance."""
     return ColourModel(chromaticity(np.array([colour_bgr]), srgb=srgb)[0], tolerance, srgb)
 
 
 def chromaticity(colours_bgr: Array, *, srgb: bool = True) -> Array:
-    """(N, 2) opponent colours over the channel sum, of colours (N, 3) 0..255; independent of the light's strength.
+    """Return (N, 2) opponent colours over channel sum, of colours (N, 3) 0..255; independent of light's strength.
 
     They are red minus green and blue minus yellow, divided by the sum: a stronger lamp scales all channels alike.
     """

@@ -67,7 +67,7 @@ def refine_outline(
     rough: Cone,
     options: DetectionOptions = DEFAULTS,
 ) -> SphereOutline | None:
-    """The outline near `rough` at full resolution, reading only its region; None if no reliable one is found.
+    """Refine the outline near `rough` at full resolution, reading only its region; None if no reliable one is found.
 
     `rough` comes from the coarse search or from a prediction and must be good to about a tenth of the radius.
     """
@@ -82,7 +82,7 @@ def refine_outlines(
     *,
     scores: Sequence[float],
 ) -> list[SphereOutline | None]:
-    """`refine_outline` for several cones; those of similar size are processed together."""
+    """Apply `refine_outline` to several cones; those of similar size are processed together."""
     out: list[SphereOutline | None] = [None] * len(roughs)
     found = {i: _by_envelope(image_bgr, camera, rough, options) for i, rough in enumerate(roughs)}
     cones = {i: cone for i, cone in found.items() if cone is not None}
@@ -104,7 +104,7 @@ def refine_outlines(
 def approach_outlines(
     image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[Cone], options: DetectionOptions = DEFAULTS
 ) -> list[AveragedCone | None]:
-    """Cones refined on pixels averaged across the outline; `roughs` must be good to 4 % of their radii."""
+    """Return the cones refined on pixels averaged across the outline; `roughs` must be good to 4 % of their radii."""
     if not roughs:
         return []
     radius_px = float(np.median([c.half_angle_rad for c in roughs])) * camera.fx
@@ -138,7 +138,7 @@ def measure_outlines(
     *,
     scores: Sequence[float] = (),
 ) -> list[SphereOutline | None]:
-    """Outlines at full resolution from cones that are good to about a pixel; None as in `refine_outline`.
+    """Measure the outlines at full resolution from cones that are good to about a pixel; None as in `refine_outline`.
 
     The larger an outline, the more edge it has and the better it determines the sphere's position, so the number of
     profiles decreases with its size. An image of 16 bits is a developed raw file, sRGB coded.
@@ -183,7 +183,7 @@ def _outline(
 def _by_envelope(
     image: NDArray[np.uint8], camera: CameraModel, rough: Cone, options: DetectionOptions
 ) -> Cone | None:
-    """The cone on which most edges agree, within a tenth of the radius around `rough`."""
+    """Return the cone on which most edges agree, within a tenth of the radius around `rough`."""
     rng = np.random.default_rng(options.seed)
     radius_px = rough.half_angle_rad * camera.fx
     reach = max(4.0, 0.1 * radius_px)
@@ -272,7 +272,7 @@ def _measure(
 
 
 def _offsets(radius: Array, blurs: Sequence[float], step: float) -> Array:
-    """(J,) positions along the profiles, for outlines of these radii and blurs."""
+    """Return (J,) positions along the profiles, for outlines of these radii and blurs."""
     typical = float(np.median(radius))
     # Inside, far enough to separate the limb's falloff from the edge; outside, only what the blurred edge needs.
     blur = max(1.0, float(np.median(blurs)))
@@ -284,7 +284,7 @@ def _offsets(radius: Array, blurs: Sequence[float], step: float) -> Array:
 def _measured(
     i: int, cone: Cone, limb: LimbFit, fit: _ConeFits, worth: tuple[float, Array, float], unit: int
 ) -> _SubpixelCone | None:
-    """Outline `i`, or None if unreliable; `worth`: radians per unit, covariance in squared units, contrast."""
+    """Return outline `i`, or None if unreliable; `worth`: radians per unit, covariance in squared units, contrast."""
     angle, covariance, contrast = worth
     blur_px = float(limb.blur[i]) * unit
     if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
@@ -322,7 +322,7 @@ class _ConeFits:
 
 
 def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bool_]) -> _ConeFits:
-    """Cones by Tukey weights on the geometric distances (G, K), linearised around the given cones.
+    """Return the cones by Tukey weights on the geometric distances (G, K), linearised around the given cones.
 
     The distances are linear in the steps, so each turn solves its weighted equations exactly: nothing is descended.
     """
@@ -354,7 +354,7 @@ def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bo
 
 
 def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
-    """(G, 3, 3) covariance of the cone's two directions and half angle, in squared units, from edge points' scatter.
+    """Return (G, 3, 3) covariance of a cone's directions and half angle, in squared units, from edge points' scatter.
 
     Neighbouring edge points share pixels, texture and shading, so their errors are correlated. Means over blocks of
     the outline show by how much they exceed those of independent points; that factor multiplies the plain covariance.
@@ -388,7 +388,7 @@ def _median_colour(image: Pixels, middle: Array, reach: float) -> tuple[float, f
 def remeasure_file(
     path: Path, camera: CameraModel, outlines: Sequence[SphereOutline], options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline | None, ...]:
-    """`remeasure` in a TIFF that `develop` made.
+    """Apply `remeasure` to a TIFF that `develop` made.
 
     Raises:
         DataError: the file is none, or it is not of the camera's size.
@@ -407,13 +407,13 @@ def remeasure_file(
 def remeasure(
     coded_bgr: Pixels, camera: CameraModel, outlines: Sequence[SphereOutline], options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline | None, ...]:
-    """The outlines that the JPEG showed, measured in another picture of the same exposure.
+    """Measure the outlines that the JPEG showed in another picture of the same exposure.
 
     Args:
         coded_bgr: (H, W, 3), sRGB coded: the noise is then about the same in shadows and lights, as the fit assumes.
         camera: intrinsics.
         outlines: found in the JPEG.
-        options: of the detector.
+        options: the detector's options.
 
     Returns:
         One for each outline; None where this picture shows none there.

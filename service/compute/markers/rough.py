@@ -29,7 +29,7 @@ class CircleCandidate:
 
 
 def colour_gradient(image: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Sobel derivatives (H, W) in x and y of each pixel's channel with the largest change; `image` is BGR."""
+    """Return Sobel derivatives (H, W) in x and y of each pixel's channel with the largest change; `image` is BGR."""
     smooth = cv2.GaussianBlur(image, (5, 5), 1.1)
     dx = cv2.Sobel(smooth, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(smooth, cv2.CV_16S, 0, 1)
@@ -45,7 +45,7 @@ def colour_gradient(image: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArra
 
 
 def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Thin edge pixels (H, W), with thresholds from the image's median gradient, not from its maximum."""
+    """Find thin edge pixels (H, W), with thresholds from the image's median gradient, not from its maximum."""
     size = np.abs(gx[::3, ::3].astype(np.int32)) + np.abs(gy[::3, ::3])
     low = float(np.clip(2.5 * np.median(size), 24, 80))
     return np.asarray(cv2.Canny(gx, gy, low, 2.2 * low) > 0)
@@ -54,7 +54,7 @@ def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
 def find_candidates(
     image: NDArray[np.uint8], least_radius: float, greatest_radius: float, min_vote: float, limit: int
 ) -> list[CircleCandidate]:
-    """Circles with radii in a range (pixels of this image), the most votes first, one for each place and size.
+    """Find circles with radii in a range (pixels of this image), the most votes first, one per place and size.
 
     Each octave of radii is searched in a copy where its smallest radius is about eleven pixels.
     """
@@ -94,7 +94,7 @@ class _EdgePixels:
     shape: tuple[int, int]  # with the margins
 
     def votes(self, radius: np.int64) -> NDArray[np.float32]:
-        """For each pixel, the share of a circle of this radius around it that votes for it."""
+        """Return for each pixel the share of a circle of this radius around it that votes for it."""
         rows, columns = self.shape
         flat = np.concatenate(
             [
@@ -109,7 +109,7 @@ class _EdgePixels:
 
 
 def _best_radii(pixels: _EdgePixels, radii: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """The most votes for any radius at each pixel, and that radius's index.
+    """Return the most votes for any radius at each pixel, and that radius's index.
 
     A circle's votes spread over neighbouring radii, so each radius has the sum of its own and those beside it.
     """
@@ -204,7 +204,7 @@ def examine(
     options: DetectionOptions,
     rng: np.random.Generator,
 ) -> RoughSphere | None:
-    """The disc at a candidate, if its outline is visible and it can be a sphere."""
+    """Return the disc at a candidate, if its outline is visible and it can be a sphere."""
     axis = np.append(camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
     length = float(np.linalg.norm(axis))
     cone = Cone(axis / length, float(np.arctan(candidate.radius / camera.fx / length)))
@@ -230,7 +230,7 @@ def _fitted(
     radius_px: float,
     rng: np.random.Generator,
 ) -> tuple[Cone, Array] | None:
-    """The cone on which most edges within reach of `near` agree, and the agreement at each of 96 azimuths."""
+    """Return the cone on which most edges within reach of `near` agree, and the agreement at each of 96 azimuths."""
     step = max(0.5, (reach_px[1] - reach_px[0]) / 48)
     where = profiles(near, camera, 96, np.arange(reach_px[0], reach_px[1] + 0.1, step))
     points = envelope_edges(sample(coarse, where.pixels), where)
@@ -256,7 +256,7 @@ def outermost(
     options: DetectionOptions,
     rng: np.random.Generator,
 ) -> RoughSphere:
-    """The disc, or a larger one of its colour whose outline surrounds it.
+    """Return the disc, or a larger one of its colour whose outline surrounds it.
 
     A glossy ball reflects the horizon as a ring on itself, which is often sharper than its limb.
     """
@@ -292,7 +292,7 @@ def _judged(
     votes: Array,
     options: DetectionOptions,
 ) -> RoughSphere | None:
-    """The disc of an outline with these votes, if it can be a sphere; otherwise None."""
+    """Return the disc of an outline with these votes, if it can be a sphere; otherwise None."""
     coverage = float(votes.mean())
     if cone.axis[2] < 0.3:
         return None
@@ -315,7 +315,7 @@ def _interior(
     camera: CameraModel,
     edgeless: NDArray[np.bool_],
 ) -> tuple[float, float, float, tuple[float, float, float]]:
-    """Edge density inside, loss of the ellipse against the colour mask, leak, and median colour.
+    """Return the edge density inside, loss of the ellipse against the colour mask, leak, and median colour.
 
     The mask holds the pixels with the chromaticity of the disc's middle; the loss is the paper's FP + FN over the
     area. The leak is the share of the outline without an edge (`edgeless`, one for each of K azimuths) across which
@@ -365,7 +365,7 @@ def share(
     model: ColourModel,
     reach: tuple[float, float] = (0.0, 0.92),
 ) -> float:
-    """Share of a disc, or of the ring between two fractions of its radius, that has the spheres' colour."""
+    """Return the share of a disc, or of the ring between two fractions of its radius, with the spheres' colour."""
     low, high = reach
     rings = np.sqrt(low**2 + (high**2 - low**2) * (np.arange(8) + 0.5) / 8)
     azimuth = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
@@ -378,5 +378,5 @@ def share(
 
 
 def apart_rad(a: Cone, b: Cone) -> float:
-    """Angle between the axes of two cones, radians."""
+    """Return the angle between the axes of two cones, radians."""
     return float(np.arccos(np.clip(a.axis @ b.axis, -1, 1)))

@@ -46,7 +46,7 @@ class View:
 class Correspondences:
     """Points of the surface in two images: pixels (N, 2) of each, and VISIBLE, OCCLUDED, OUTSIDE or UNKNOWN (N,).
 
-    Pixels of the second image are stated wherever the point is in front of its camera, else they are NaN.
+    Pixels of the second image are given wherever the point is in front of its camera, else they are NaN.
     """
 
     first_px: Array = field(repr=False)
@@ -104,11 +104,11 @@ class MatchingData:
 
     @property
     def names(self) -> set[str]:
-        """Of the views."""
+        """The names of the views."""
         return set(self._views)
 
     def view(self, name: str) -> View:
-        """A view with its depth, read from its file at each call."""
+        """Return a view with its depth, read from its file at each call."""
         record = self._views[name]
         # Opened here: of a damaged archive, NumPy leaves the file open.
         with (self._folder / record["depth"]).open("rb") as file, np.load(file) as archive:
@@ -117,12 +117,12 @@ class MatchingData:
         return View(self._folder / record["image"], K, T_world_camera, depth_m)
 
     def correspondences(self, pair: Pair, step: int = 1) -> Correspondences:
-        """Those of every `step`-th pixel and row of the first image that has ground truth."""
+        """Return those of every `step`-th pixel and row of the first image that has ground truth."""
         return correspondences(self.view(pair["first"]), self.view(pair["second"]), step=step)
 
 
 def correspondences(first: View, second: View, pixels: Array | None = None, *, step: int = 1) -> Correspondences:
-    """Where points of the surface that the first image shows are in the second.
+    """Find where points of the surface that the first image shows are in the second.
 
     Args:
         first: image in which the points are given.
@@ -140,13 +140,13 @@ def correspondences(first: View, second: View, pixels: Array | None = None, *, s
 
 
 def _with_ground_truth(depth_m: NDArray[np.float32], step: int) -> Array:
-    """(N, 2) every `step`-th pixel and row that has a depth."""
+    """Return (N, 2) every `step`-th pixel and row that has a depth."""
     v, u = np.nonzero(depth_m[::step, ::step] > 0)
     return np.stack([u, v], axis=1).astype(np.float64) * step
 
 
 def look_up(world_m: Array, view: View) -> tuple[Array, NDArray[np.uint8]]:
-    """Pixels (N, 2) of points (N, 3) of the surface in a view, and their status (N,); NaN points are UNKNOWN.
+    """Return pixels (N, 2) of surface points (N, 3) in a view, and their status (N,); NaN points are UNKNOWN.
 
     At the outline of what hides a point, the status is exact to a pixel.
     """
@@ -173,7 +173,7 @@ def look_up(world_m: Array, view: View) -> tuple[Array, NDArray[np.uint8]]:
 
 
 def surface_depth(depth_m: NDArray[np.float32], K: Array, pixels: Array) -> Array:
-    """(N,) depth between the pixel centres; NaN outside the image, without ground truth, and at edges of the surface.
+    """Return (N,) depth between pixel centres; NaN outside the image, without ground truth, and at surface edges.
 
     The inverse depth of a plane is linear in the pixel, so it is what is interpolated: exact on the faces of a mesh.
     """
@@ -190,7 +190,7 @@ def surface_depth(depth_m: NDArray[np.float32], K: Array, pixels: Array) -> Arra
 
 
 def _around(depth_m: NDArray[np.float32], pixels: Array) -> tuple[Array, Array]:
-    """Depth (N, 4) at the four pixels around each place, and their bilinear weights (N, 4)."""
+    """Return the depth (N, 4) at the four pixels around each place, and their bilinear weights (N, 4)."""
     height, width = depth_m.shape
     placed = np.nan_to_num(pixels, nan=0.0)
     u = np.clip(np.floor(placed[:, 0]).astype(np.int64), 0, max(width - 2, 0))

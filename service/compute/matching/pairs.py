@@ -32,12 +32,12 @@ class Covisibility:
     overlap: Array = field(repr=False)
 
     def pairs(self, least_overlap: float = LEAST_OVERLAP) -> list[tuple[int, int]]:
-        """Pairs of views, first < second, whose overlap is at least this in both directions."""
+        """Return the pairs of views, first < second, whose overlap is at least this in both directions."""
         both = np.minimum(self.overlap, self.overlap.T) >= least_overlap
         return [(int(i), int(j)) for i, j in np.argwhere(np.triu(both & (self.common > 0), k=1))]
 
     def components(self, least_overlap: float = LEAST_OVERLAP) -> NDArray[np.int64]:
-        """(V,) number of the connected part of the graph of these pairs that each view belongs to."""
+        """Return (V,) number of the connected part of the graph of these pairs that each view belongs to."""
         edges = np.array(self.pairs(least_overlap), dtype=np.int64).reshape(-1, 2)
         n = len(self.seen)
         graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
@@ -46,12 +46,12 @@ class Covisibility:
 
 
 def points_seen(points_m: Array, view: View) -> NDArray[np.bool_]:
-    """Mask (P,) of the surface points (P, 3) that a view shows: neither occluded nor covered by a marker."""
+    """Return the mask (P,) of surface points (P, 3) that a view shows: not occluded or covered by a marker."""
     return look_up(points_m, view)[1] == VISIBLE
 
 
 def covisibility(seen: NDArray[np.bool_]) -> Covisibility:
-    """Overlaps of views that see these points (V, P), which lie evenly on the surface.
+    """Return the overlaps of views that see these points (V, P), which lie evenly on the surface.
 
     The overlap of a with b is |points of both| / |points of a|. Only the numerator is symmetric: a close view may lie
     within a far one.
@@ -64,12 +64,12 @@ def covisibility(seen: NDArray[np.bool_]) -> Covisibility:
 
 
 def relative_pose(T_world_first: Transform, T_world_second: Transform) -> Transform:
-    """T_second_first (4, 4): maps points of the first camera's frame to the second's."""
+    """Return T_second_first (4, 4): maps points of the first camera's frame to the second's."""
     return inverse(T_world_second) @ T_world_first
 
 
 def relative_covariance(T_world_first: Transform, T_world_second: Transform, joint: Array) -> Array:
-    """(6, 6) covariance of T_second_first from the joint covariance of both poses.
+    """Return (6, 6) covariance of T_second_first from the joint covariance of both poses.
 
     Perturbations are those of the conventions, exp([w]x) R and t + d. With R, t of the second pose and R', t' of the
     first, the relative rotation R^T R' becomes R^T exp(-[w]x) exp([w']x) R', and the relative position R^T (t' - t)
@@ -86,7 +86,8 @@ def relative_covariance(T_world_first: Transform, T_world_second: Transform, joi
     Args:
         T_world_first: pose of the first camera.
         T_world_second: pose of the second camera.
-        joint: (12, 12) of (d', w') of the first and (d, w) of the second pose, with their correlations, m and rad.
+        joint: (12, 12) covariance of (d', w') of the first and (d, w) of the second pose, with their correlations, m
+            and rad.
     """
     R = T_world_second[:3, :3]
     J = np.zeros((6, 12))
@@ -104,12 +105,12 @@ OVERLAP_STEPS = (0.6, 0.4, 0.2)
 
 @dataclass(frozen=True, slots=True)
 class Difficulty:
-    """What makes a pair difficult.
+    """The measures that make a pair difficult.
 
     Attributes:
         angle_deg: median angle at the common points between the rays to both cameras.
         scale: median ratio of the sizes of the common points' surroundings in both images, at least 1.
-        overlap: the smaller one of both directions.
+        overlap: smaller one of the overlaps in both directions.
     """
 
     angle_deg: float
@@ -126,7 +127,7 @@ class Difficulty:
 
 
 def difficulty(common_m: Array, first: View, second: View, overlap: float) -> Difficulty:
-    """The difficulty of a pair with these common points (N, 3), N > 0, in the world frame."""
+    """Return the difficulty of a pair with these common points (N, 3), N > 0, in the world frame."""
     rays = [common_m - view.T_world_camera[:3, 3] for view in (first, second)]
     cosine = np.sum(rays[0] * rays[1], axis=1) / np.prod([np.linalg.norm(ray, axis=1) for ray in rays], axis=0)
     angle_rad = float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
@@ -144,10 +145,10 @@ class ListedPair:
     Attributes:
         first, second: names, in order.
         overlap: share of the points of the first view that the second sees too, and of the second view's.
-        common_points: that both see.
+        common_points: number of points that both see.
         difficulty: its measures and class.
         T_second_first: (4, 4), m.
-        covariance: (6, 6) of it, as `relative_covariance`; None where the poses' own errors are not known.
+        covariance: (6, 6) covariance of it, as `relative_covariance`; None where the poses' own errors are not known.
     """
 
     first: str
@@ -159,7 +160,7 @@ class ListedPair:
     covariance: Array | None = field(repr=False)
 
     def record(self) -> Pair:
-        """The pair as pairs.json has it."""
+        """Return the pair as pairs.json has it."""
         return {
             "first": self.first,
             "second": self.second,
@@ -177,12 +178,12 @@ class ListedPair:
 def listed_pairs(
     views: Mapping[str, View], points_m: Array, covisible: Covisibility, errors: Array | None = None
 ) -> list[ListedPair]:
-    """The pairs of views that overlap, in the order of their names.
+    """List the pairs of views that overlap, in the order of their names.
 
     Args:
-        views: by name, in the order of `covisible`; their depth is not needed.
+        views: views by name, in the order of `covisible`; their depth is not needed.
         points_m: (P, 3) points of the surface, in the world frame.
-        covisible: what the views see of them.
+        covisible: the points that each view sees.
         errors: (6 V, 6 V) joint covariance of the poses; errors common to all cancel; None if unknown.
     """
     names = list(views)
@@ -210,6 +211,6 @@ def listed_pairs(
 
 
 def _of_pair(errors: Array, i: int, j: int) -> Array:
-    """(12, 12) part of a joint covariance that belongs to two poses."""
+    """Return (12, 12) part of a joint covariance that belongs to two poses."""
     rows = np.concatenate([6 * i + np.arange(6), 6 * j + np.arange(6)])
     return errors[np.ix_(rows, rows)]

@@ -25,7 +25,7 @@ PRECISION_PX = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0)  # at which precision is measured
 
 
 def match_errors_px(matches: Matches, first: View, second: View) -> Array:
-    """Errors (M,): distance of each match in the second image from the true correspondence of its pixel in the first.
+    """Return errors (M,): distance of each match in the second image from its true place there.
 
     Infinite where the second image does not show the point, so that there is nothing to match. NaN without ground
     truth, such as beside the specimen or on a marker: such matches are not scored.
@@ -38,19 +38,19 @@ def match_errors_px(matches: Matches, first: View, second: View) -> Array:
 
 
 def precisions(errors_px: Array) -> tuple[float, ...]:
-    """Share of the scored matches within each of PRECISION_PX; 0 if none is scored."""
+    """Return the share of the scored matches within each of PRECISION_PX; 0 if none is scored."""
     scored = errors_px[~np.isnan(errors_px)]
     return tuple(float(np.mean(scored < limit)) if len(scored) else 0.0 for limit in PRECISION_PX)
 
 
 def fundamental_matrix(T_second_first: Transform, K_first: Array, K_second: Array) -> Array:
-    """F (3, 3) with x_second^T F x_first = 0 for corresponding pixels (Hartley and Zisserman, 2nd edition, 9.2.4)."""
+    """Return F (3, 3) with x_second^T F x_first = 0 for corresponding pixels (Hartley and Zisserman 2004, 9.2.4)."""
     E = skew(T_second_first[:3, 3]) @ T_second_first[:3, :3]
     return np.linalg.inv(K_second).T @ E @ np.linalg.inv(K_first)
 
 
 def epipolar_errors_px(matches: Matches, F: Array) -> Array:
-    """(M,) mean distance of both pixels of a match from the epipolar line of the other."""
+    """Return (M,) mean distance of both pixels of a match from the epipolar line of the other."""
     first, second = (
         np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
         for pixels in (matches.first_px, matches.second_px)
@@ -73,9 +73,9 @@ class PoseError:
     """Angles between an estimated relative pose and the true one, degrees.
 
     Attributes:
-        rotation_deg: of the rotation that is left.
-        translation_deg: between the directions of the translations, at most 90°: an essential matrix does not tell
-            their sign.
+        rotation_deg: angle of the rotation that is left.
+        translation_deg: angle between the directions of the translations, at most 90°: an essential matrix does not
+            give their sign.
     """
 
     rotation_deg: float
@@ -88,7 +88,7 @@ class PoseError:
 
 
 def pose_from_matches(matches: Matches, K_first: Array, K_second: Array) -> tuple[Array, Array, int]:
-    """Rotation (3, 3), direction (3,) of the translation of T_second_first, and the number of inliers.
+    """Return the rotation (3, 3), direction (3,) of the translation of T_second_first, and the number of inliers.
 
     An essential matrix by MAGSAC++ (Barath et al., CVPR 2020), as OpenCV's USAC has it, with a threshold of INLIER_PX
     in images of the mean focal length. The same matches give the same pose.
@@ -120,7 +120,7 @@ def pose_from_matches(matches: Matches, K_first: Array, K_second: Array) -> tupl
 
 
 def pose_error(R: Array, direction: Array, T_second_first: Transform) -> PoseError:
-    """The error of a rotation (3, 3) and a direction (3,) of translation."""
+    """Return the error of a rotation (3, 3) and a direction (3,) of translation."""
     rotation_rad = float(Rotation.from_matrix(R @ T_second_first[:3, :3].T).magnitude())
     true = T_second_first[:3, 3]
     cosine = float(direction @ true / max(np.linalg.norm(direction) * np.linalg.norm(true), 1e-300))
@@ -128,7 +128,7 @@ def pose_error(R: Array, direction: Array, T_second_first: Transform) -> PoseErr
 
 
 def auc(errors_deg: Sequence[float], threshold_deg: float) -> float:
-    """Area under the cumulative curve of pose errors up to a threshold, over the threshold: 0 to 1.
+    """Return the area under the cumulative curve of pose errors up to a threshold, over the threshold: 0 to 1.
 
     Defined as in Sarlin et al. (SuperGlue, CVPR 2020) and later work. The curve is piecewise linear from (0, 0)
     through (error k, k / n), with the errors in order, and level from the last error below the threshold. A pair
@@ -154,17 +154,17 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class PairScore:
-    """What a method did on a pair.
+    """The result of a method on a pair.
 
     Attributes:
         first, second, difficulty: the pair.
-        matches: that it found.
+        matches: number of matches that it found.
         scored: those whose pixel in the first image has ground truth.
         precision: share of these within each of PRECISION_PX.
         pose: error of the relative pose; infinite without one.
         inliers: matches that agree with the estimated pose.
         epipolar_px: median of the epipolar errors; infinite without a match.
-        seconds: for the matching alone. Features of an image are extracted with its first pair.
+        seconds: time for the matching alone. Features of an image are extracted with its first pair.
     """
 
     first: str
@@ -190,7 +190,7 @@ def chosen_pairs(pairs: Sequence[Pair], per_class: int) -> list[Pair]:
 
 
 def evaluate(match: Match, data: MatchingData, pairs: Sequence[Pair], progress: Progress) -> list[PairScore]:
-    """The scores of a method on pairs. It is given their pictures alone; poses and depth only judge it.
+    """Return the scores of a method on pairs. It is given their pictures alone; poses and depth only judge it.
 
     Raises:
         DataError: a file of the data set cannot be read.
@@ -208,7 +208,7 @@ def evaluate(match: Match, data: MatchingData, pairs: Sequence[Pair], progress: 
 
 
 def score_pair(found: Matches, pair: Pair, first: View, second: View, seconds: float) -> PairScore:
-    """The score of the matches of a pair."""
+    """Return the score of the matches of a pair."""
     T_second_first = np.array(pair["T_second_first"])
     errors = match_errors_px(found, first, second)
     epipolar = epipolar_errors_px(found, fundamental_matrix(T_second_first, first.K, second.K))
@@ -239,7 +239,7 @@ class LoadedViews:
         self._known: OrderedDict[str, tuple[View, Picture]] = OrderedDict()
 
     def read(self, name: str) -> tuple[View, Picture]:
-        """A view and its picture.
+        """Read a view and its picture.
 
         Raises:
             DataError: a file cannot be read.

@@ -1,1 +1,1 @@
-"""What belongs to each pixel of a posed image: rays, depth, normals, masks, undistorted images and crops."""
+"""Computes what belongs to each pixel of a posed image: rays, depth, normals, masks, undistorted images and crops."""

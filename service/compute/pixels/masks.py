@@ -38,19 +38,19 @@ class Cylinder:
 
 
 def posts_below(spheres: Sequence[WorldSphere], up: Array, length_m: float, radius_m: float) -> tuple[Cylinder, ...]:
-    """A post from the centre of each sphere downwards; `up` (3,) is a unit vector in the world frame."""
+    """Return a post from the centre of each sphere downwards; `up` (3,) is a unit vector in the world frame."""
     return tuple(Cylinder(sphere.centre_m, sphere.centre_m - length_m * up, radius_m) for sphere in spheres)
 
 
 def marker_mask(
     camera: CameraModel, T_world_camera: Transform, spheres: Sequence[WorldSphere], posts: Sequence[Cylinder] = ()
 ) -> NDArray[np.bool_]:
-    """(H, W) pixels that a sphere or post covers or touches, also where something else hides it.
+    """Compute the (H, W) pixels that a sphere or post covers or touches, also where something else hides it.
 
     An outline is widened to whole pixels, so the mask never misses a pixel of a marker.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     T_camera_world = inverse(T_world_camera)
@@ -66,12 +66,12 @@ def marker_mask(
 
 
 def hull_mask(camera: CameraModel, T_world_camera: Transform, points_m: Array) -> NDArray[np.bool_]:
-    """(H, W) pixels within the outline of points (N, 3) of the world, for example the spheres around a specimen.
+    """Compute the (H, W) pixels within the outline of points (N, 3) of the world, such as a specimen's spheres.
 
     Points behind the camera do not count.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     points = apply(inverse(T_world_camera), points_m)
@@ -80,7 +80,7 @@ def hull_mask(camera: CameraModel, T_world_camera: Transform, points_m: Array) -
 
 
 def _hull(points: Array) -> Array:
-    """Rays (K, 3) of the outline of points (N, 3) before the camera."""
+    """Return the rays (K, 3) of the outline of points (N, 3) before the camera."""
     flat = (points[:, :2] / points[:, 2:]).astype(np.float32)
     if len(flat) < 3:
         return np.empty((0, 3))
@@ -96,7 +96,7 @@ def _sphere_outline(centre: Array, radius_m: float) -> Array:
 
 
 def _post_outline(ends: Array, radius_m: float) -> Array:
-    """Rays (N, 3) of the outline: the convex hull of the images of both ends."""
+    """Return the rays (N, 3) of the outline: the convex hull of the images of both ends."""
     near = 2 * radius_m
     low, high = ends[np.argsort(ends[:, 2])]
     if high[2] <= near:
@@ -111,7 +111,7 @@ def _post_outline(ends: Array, radius_m: float) -> Array:
 
 
 def _frustum(rays: PixelRays, camera: CameraModel) -> Array:
-    """(5, 3) planes with n · ray >= 0 for all rays of the image and a margin around it."""
+    """Return (5, 3) planes with n · ray >= 0 for all rays of the image and a margin around it."""
     edge = np.concatenate([rays.xy(0, 1)[0], rays.xy(camera.height - 1, camera.height)[0]])
     sides = np.einsum("vk,kuc->vuc", rays.rows, rays.columns[:, [0, -1]]).reshape(-1, 2)
     margin = _MARGIN_PX / np.array([camera.fx, camera.fy])
@@ -135,7 +135,7 @@ def _fill(mask: NDArray[np.uint8], camera: CameraModel, frustum: Array, outline:
 
 
 def _cut(polygon: Array, plane: Array) -> Array:
-    """The part of a convex polygon of rays (N, 3) with plane · ray >= 0 (Sutherland and Hodgman, 1974)."""
+    """Return the part of a convex polygon of rays (N, 3) with plane · ray >= 0 (Sutherland and Hodgman, 1974)."""
     kept: list[Array] = []
     height = polygon @ plane
     for i in range(len(polygon)):

@@ -1,6 +1,6 @@
-"""EXIF of exported photographs: kept, copied to resampled ones; on request without what names a person or place.
+"""Preserves the EXIF of exported photographs and copies it to resampled ones; on request, without personal data.
 
-The camera's serial numbers are personal data where one person owns the camera.
+Personal data name a person or a place. The camera's serial numbers do too where one person owns the camera.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ def without_personal_data(picture: bytes, where: str = "") -> bytes:
 
 
 def with_metadata_of(original: bytes, resampled: bytes, *, personal: bool, where: str = "") -> bytes:
-    """The resampled picture with the EXIF of the photograph that it was made from, and its own size in it.
+    """Return the resampled picture with the EXIF of the photograph that it was made from, and its own size in it.
 
     Args:
         original: JPEG or PNG as the camera wrote it.
         resampled: JPEG or PNG without metadata, which it stays if those of the original are broken.
-        personal: whether GPS, owner and serial numbers are carried over too.
+        personal: true to carry over GPS, owner and serial numbers too.
         where: the file, for messages.
 
     Raises:
@@ -102,7 +102,7 @@ class _BrokenMetadataError(DataError):
 
 
 def _changed(picture: bytes, change: Callable[[Any], object], where: str) -> bytes:
-    """The picture with its metadata changed; broken metadata of a JPEG are dropped before."""
+    """Return the picture with its metadata changed; broken metadata of a JPEG are dropped before."""
     try:
         return _written(picture, change, where)
     except _BrokenMetadataError:

@@ -27,7 +27,7 @@ class PixelRays:
     """Normalised coordinates x/z, y/z of every pixel centre: rows[v] @ columns, both as polynomials.
 
     Attributes:
-        width, height: of the image in pixels.
+        width, height: size of the image in pixels.
         rows: (height, K) basis of the row.
         columns: (K, width, 2) basis of the column, for x and y.
     """
@@ -38,19 +38,19 @@ class PixelRays:
     columns: Array
 
     def xy(self, begin: int, end: int) -> Array:
-        """(end - begin, width, 2) undistorted x/z, y/z of the pixel centres of rows [begin, end)."""
+        """Return (end - begin, width, 2) undistorted x/z, y/z of the pixel centres of rows [begin, end)."""
         flat = self.columns.reshape(len(self.columns), -1)
         return (self.rows[begin:end] @ flat).reshape(end - begin, self.width, 2)
 
     def turned(self, rotation: Array) -> NDArray[np.float32]:
-        """(K, width, 3) columns of the directions rotation (3, 3) @ (x, y, 1): multiply by `rows` as float32."""
+        """Return (K, width, 3) columns of directions rotation (3, 3) @ (x, y, 1): multiply by `rows` as float32."""
         turned = self.columns @ rotation[:, :2].T
         turned[0] += rotation[:, 2]  # the first basis function of the rows is 1
         return turned.astype(np.float32)
 
 
 def pixel_rays(camera: CameraModel) -> PixelRays:
-    """The rays of a camera, distorted or not; pixel centres lie at integer coordinates.
+    """Return the rays of a camera, distorted or not; pixel centres lie at integer coordinates.
 
     The inverse of the distortion has no closed form. It is interpolated at Chebyshev nodes of the whole image, which
     converges geometrically for a smooth function (Trefethen, "Approximation Theory and Approximation Practice",
@@ -95,12 +95,12 @@ def _interpolated(camera: CameraModel, degree: int) -> PixelRays:
 
 
 def _basis(size: int, degree: int) -> Array:
-    """(size, degree + 1) Chebyshev polynomials at the pixel centres."""
+    """Return (size, degree + 1) Chebyshev polynomials at the pixel centres."""
     return np.asarray(chebyshev.chebvander(np.linspace(-1.0, 1.0, size), degree), dtype=np.float64)
 
 
 def _error_px(rays: PixelRays, camera: CameraModel) -> float:
-    """Largest distance between a pixel and the projection of its ray, over a grid that reaches the image's edges."""
+    """Return the largest distance between a pixel and its ray's projection, over a grid up to the image's edges."""
     u, v = (np.unique(np.linspace(0, size - 1, _CHECKED).astype(int)) for size in (rays.width, rays.height))
     xy = np.einsum("vk,kuc->vuc", rays.rows[v], rays.columns[:, u])
     points = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2).reshape(-1, 3)
@@ -138,7 +138,7 @@ class RayMesh:
         return _tree(self._near, self._faces)
 
     def first_face(self, eye_m: Array, directions: NDArray[np.float32]) -> NDArray[np.int32]:
-        """The index (N,) of the first face that each ray from the eye (3,) along (N, 3) hits; -1 for none.
+        """Return the index (N,) of the first face that each ray from the eye (3,) along (N, 3) hits; -1 for none.
 
         Raises:
             ConfigurationError: embreex, which casts the rays, is not installed.
@@ -147,7 +147,7 @@ class RayMesh:
         return np.asarray(self._scene.run(np.broadcast_to(origin, directions.shape), directions), dtype=np.int32)
 
     def depths(self, T_world_camera: Transform, rays: Array) -> Array:
-        """Depth (N,) along z at which rays (N, 3) of a camera, with z = 1, meet the surface; NaN where they do not.
+        """Return depths (N,) along z at which rays (N, 3) of a camera, z = 1, meet the surface; NaN if they do not.
 
         Raises:
             ConfigurationError: embreex, which casts the rays, is not installed.
@@ -160,7 +160,7 @@ class RayMesh:
         return np.where((face >= 0) & np.isfinite(depth) & (depth > 0), depth, np.nan)
 
     def planes_seen(self, T_world_camera: Transform) -> Array:
-        """(F + 1, 4) each face's unit normal towards the camera, in its frame, and n · p (≤ 0) for its points p.
+        """Return (F + 1, 4) faces' unit normals towards the camera, in its frame, and n · p (≤ 0) for their points p.
 
         The last row, which the index -1 names, is zero.
         """
@@ -173,7 +173,7 @@ class RayMesh:
 
 
 def _planes(vertices_m: Array, faces: NDArray[np.integer]) -> tuple[Array, Array]:
-    """Unit normals (F, 3) and offsets n · p (F,); NaN for faces without area."""
+    """Return the unit normals (F, 3) and offsets n · p (F,); NaN for faces without area."""
     normal, offset = np.empty((len(faces), 3)), np.empty(len(faces))
     for begin in range(0, len(faces), _CHUNK):
         chosen = slice(begin, begin + _CHUNK)
@@ -236,10 +236,10 @@ class SurfaceImage:
 
 
 def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Iterator[SurfaceRows]:
-    """The mesh as the camera at T_world_camera (4, 4) sees it, from the first rows of the image to the last.
+    """Yield the mesh as the camera at T_world_camera (4, 4) sees it, from the first rows of the image to the last.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     rays = pixel_rays(camera)
     planes = surface.planes_seen(T_world_camera)
@@ -254,7 +254,7 @@ def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) 
 
 
 def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: int) -> SurfaceRows:
-    """Depth and normal of the rays of some rows on the planes (N, 4) of the faces that they hit."""
+    """Return the depth and normal of the rays of some rows on the planes (N, 4) of the faces that they hit."""
     plane = planes.reshape(end - begin, rays.width, 4)
     xy = rays.xy(begin, end)
     slope = plane[..., 0] * xy[..., 0]
@@ -271,10 +271,10 @@ def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: in
 
 
 def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> SurfaceImage:
-    """The whole image at once: 16 bytes for each pixel, 1 GB at 60 million.
+    """Render the whole image at once: 16 bytes for each pixel, 1 GB at 60 million.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     depth = np.empty((camera.height, camera.width), dtype=np.float32)
     normal = np.empty((camera.height, camera.width, 3), dtype=np.float32)
@@ -285,10 +285,10 @@ def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Su
 
 
 def depth_map(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Float32s:
-    """(H, W) z-depth in metres alone; 0 where no surface is seen.
+    """Render (H, W) z-depth in metres alone; 0 where no surface is seen.
 
     Raises:
-        ComputeError: as `pixel_rays`.
+        ComputeError: the distortion folds within the image, so that some pixels have no ray.
     """
     depth = np.empty((camera.height, camera.width), dtype=np.float32)
     for rows in seen_rows(surface, camera, T_world_camera):
@@ -302,12 +302,12 @@ _TOLERANCE_M = 1e-3  # a point so far behind the depth of its pixel is still on 
 def seen_points(
     points_m: Array, camera: CameraModel, T_world_camera: Transform, depth_m: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
+    """Return whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
 
     Args:
-        points_m: on the surface that the depth is of.
-        camera: of the depth.
-        T_world_camera: (4, 4) of the view.
+        points_m: (N, 3) points on the surface whose depth `depth_m` is.
+        camera: the camera of the depth.
+        T_world_camera: (4, 4) pose of the view.
         depth_m: (H, W) z of the surface; 0 where none is seen.
     """
     before = apply(inverse(T_world_camera), points_m)
@@ -326,7 +326,7 @@ def seen_points(
 def covered_shares(
     counts: NDArray[np.int64], points_m: Array, triangles: NDArray[np.int64], at_least: Sequence[int]
 ) -> tuple[float, ...]:
-    """Share of a mesh's area that at least so many views see, for each number in `at_least`.
+    """Return the share of a mesh's area that at least so many views see, for each number in `at_least`.
 
     Args:
         counts: (V,) views that see each vertex.

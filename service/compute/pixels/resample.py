@@ -34,12 +34,12 @@ class Undistorted:
 
 
 def pinhole_of(camera: CameraModel) -> CameraModel:
-    """The camera without its distortion: same size, focal lengths and principal point."""
+    """Return the camera without its distortion: same size, focal lengths and principal point."""
     return dataclasses.replace(camera, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
 
 
 def undistorted(image: NDArray[np.uint8], camera: CameraModel) -> Undistorted:
-    """The photograph (H, W) or (H, W, 3) as the pinhole camera `pinhole_of(camera)` would have taken it.
+    """Return the photograph (H, W) or (H, W, 3) as the pinhole camera `pinhole_of(camera)` would have taken it.
 
     Cubic interpolation at places rounded to 1/32 px, in tiles of rows.
     """
@@ -56,7 +56,7 @@ def undistorted(image: NDArray[np.uint8], camera: CameraModel) -> Undistorted:
 
 
 def valid_pixels(camera: CameraModel) -> NDArray[np.bool_]:
-    """(H, W) pixels of the undistorted image for which the photograph has one."""
+    """Return (H, W) pixels of the undistorted image for which the photograph has one."""
     valid = np.empty((camera.height, camera.width), dtype=np.bool_)
     for begin, end, at in _places(pinhole_of(camera), camera):
         valid[begin:end] = _within(at, camera)
@@ -64,7 +64,7 @@ def valid_pixels(camera: CameraModel) -> NDArray[np.bool_]:
 
 
 def _places(pinhole: CameraModel, camera: CameraModel) -> Iterator[tuple[int, int, Array]]:
-    """For tiles of rows [begin, end) of the undistorted image: (end - begin, W, 2) places in the photograph."""
+    """Yield tiles of rows [begin, end) of the undistorted image, and (end - begin, W, 2) places in the photograph."""
     rays = pixel_rays(pinhole)
     step = max(1, _RAYS // camera.width)
     for begin in range(0, camera.height, step):
@@ -80,7 +80,7 @@ def _within(at: Array, camera: CameraModel) -> NDArray[np.bool_]:
 
 
 def camera_at(camera: CameraModel, width: int, height: int) -> CameraModel:
-    """The camera of the image that `resample` returns.
+    """Return the camera of the image that `resample` returns.
 
     Raises:
         ConfigurationError: the size is larger than the photograph.
@@ -91,7 +91,7 @@ def camera_at(camera: CameraModel, width: int, height: int) -> CameraModel:
 
 
 def resample(image: NDArray[np.uint8], camera: CameraModel, width: int, height: int) -> NDArray[np.uint8]:
-    """The photograph (H, W, 3) as (height, width, 3): reduced by area averaging, then cropped evenly on both sides.
+    """Resize a photograph (H, W, 3) to (height, width, 3): reduce by area averaging, then crop evenly.
 
     An aspect ratio other than the camera's (1920 × 1080 from a 3:2 sensor, as in the paper) crops two sides; pixels
     stay square.

@@ -27,12 +27,12 @@ class Splits:
     test: tuple[str, ...]
 
     def named(self) -> dict[str, tuple[str, ...]]:
-        """The splits by name."""
+        """Return the splits by name."""
         return {"dense": self.dense, "sparse": self.sparse, "train": self.train, "test": self.test}
 
 
 def splits(sees: Mapping[str, NDArray[np.bool_]], sparse_views: int = SPARSE_VIEWS) -> Splits:
-    """Splits of views, each with the points (N,) of the specimen that it sees.
+    """Return the splits of views, each with the points (N,) of the specimen that it sees.
 
     Raises:
         DataError: there is no view.
@@ -46,7 +46,7 @@ def splits(sees: Mapping[str, NDArray[np.bool_]], sparse_views: int = SPARSE_VIE
 
 
 def sparse_choice(names: Sequence[str], sees: Sequence[NDArray[np.bool_]], count: int) -> tuple[str, ...]:
-    """The `count` views that see most together, in the order of `names`; of equal choices the first.
+    """Return the `count` views that see most together, in the order of `names`; of equal choices the first.
 
     A point counts fully for the first view that sees it, half for the second, a quarter for the third: reconstruction
     needs two views of a point, and further ones help less. Chosen one after the other, which is within 63 % of the
@@ -80,7 +80,7 @@ class ImageCrop:
     height: int
 
     def camera(self, camera: CameraModel) -> CameraModel:
-        """The crop's camera: the principal point is shifted, all else is the same."""
+        """Return the crop's camera: the principal point is shifted, all else is the same."""
         return dataclasses.replace(
             camera, width=self.width, height=self.height, cx=camera.cx - self.x, cy=camera.cy - self.y
         )
@@ -94,7 +94,7 @@ class ImageCrop:
 def marker_free_crops(
     wanted: Mask, forbidden: Mask, size: tuple[int, int] = FULL_HD, most: int = 16
 ) -> list[ImageCrop]:
-    """Crops without a forbidden pixel that show most of the wanted pixels, the best first.
+    """Choose crops without a forbidden pixel that show most of the wanted pixels, the best first.
 
     Each further crop is the one that shows most pixels which no earlier one shows, as long as these are a twentieth
     of it. Equal ones are chosen from the top left. The answer is empty where no place is free of markers.
@@ -103,7 +103,7 @@ def marker_free_crops(
         wanted: (H, W) the specimen.
         forbidden: (H, W) spheres and posts.
         size: width and height of a crop.
-        most: at most so many crops.
+        most: largest number of crops.
 
     Raises:
         ConfigurationError: a crop is larger than the image, or smaller than 8 px.
@@ -130,14 +130,14 @@ def marker_free_crops(
 
 
 def _pooled(mask: Mask) -> NDArray[np.int64]:
-    """Pixels of the mask in each cell; cells at the right and lower edge may be cut."""
+    """Return the pixels of the mask in each cell; cells at the right and lower edge may be cut."""
     height, width = (-(-n // _CELL_PX) for n in mask.shape)
     rows = np.add.reduceat(mask, np.arange(height) * _CELL_PX, axis=0, dtype=np.int64)
     return np.add.reduceat(rows, np.arange(width) * _CELL_PX, axis=1)
 
 
 def _window_sums(cells: NDArray[np.int64], window: tuple[int, int], places: tuple[int, int]) -> NDArray[np.int64]:
-    """(places) sums over windows of cells that begin at each place."""
+    """Return (places) sums over windows of cells that begin at each place."""
     total = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.int64)
     np.cumsum(np.cumsum(cells, axis=0), axis=1, out=total[1:, 1:])
     (h, w), (rows, columns) = window, places
@@ -150,7 +150,7 @@ _MOST = 65535
 
 
 def coded_depth(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """(H, W) whole numbers of 0.1 mm, rounded; 0 where there is no depth.
+    """Return (H, W) whole numbers of 0.1 mm, rounded; 0 where there is no depth.
 
     Raises:
         DataError: a depth is beyond 6.5535 m.

@@ -56,14 +56,14 @@ class Contact:
     clearance_m: float  # negative: depth of the overlap
 
     def __str__(self) -> str:
-        """The contact in words, for a technician."""
+        """Describe the contact for a technician."""
         if self.clearance_m < 0:
             return f"the {self.first} would touch the {self.second}"
         return f"the {self.first} would come within {mm(self.clearance_m):.0f} mm of the {self.second}"
 
 
 def link_segments(body: ArmBody, joints_rad: Array) -> tuple[Array, Array, Array]:
-    """Capsules of the P parts at joints (K, N): starts (K, P, 3), ends (K, P, 3), radii (P,), in the base frame."""
+    """Return capsules of P parts at joints (K, N): starts, ends (K, P, 3) and radii (P,), in the base frame."""
     links, frames = body.model.links, chain(body.model.joint_values(joints_rad))
     T_base_part = np.concatenate(
         [frames[:, [link.frame for link in links]], frames[:, -1:] @ body.T_flange_camera], axis=1
@@ -76,7 +76,7 @@ def link_segments(body: ArmBody, joints_rad: Array) -> tuple[Array, Array, Array
 
 
 def nearest_contacts(body: ArmBody, obstacles: Obstacles, joints_rad: Array) -> list[Contact]:
-    """The pair with the least clearance at each of the joints (K, N), without pairs that the arm's model allows."""
+    """Find the pair with the least clearance at each of the joints (K, N), except pairs that the model allows."""
     starts, ends, radii = link_segments(body, joints_rad)
     parts, allowed = body.parts, body.model.allowed
     pairs: list[tuple[str, str]] = []
@@ -113,7 +113,7 @@ def nearest_contacts(body: ArmBody, obstacles: Obstacles, joints_rad: Array) -> 
 
 
 def straight_path(start_rad: Array, end_rad: Array, step_rad: float) -> Array:
-    """Joints (K, N) on the straight path in joint space, both ends included, in steps of at most `step_rad`."""
+    """Return joints (K, N) on the straight path in joint space, both ends included, at most `step_rad` apart."""
     count = max(1, int(np.ceil(float(np.abs(end_rad - start_rad).max()) / step_rad)))
     return start_rad + np.linspace(0.0, 1.0, count + 1)[:, None] * (end_rad - start_rad)
 
@@ -122,7 +122,7 @@ _TINY = 1e-15
 
 
 def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
-    """Least distance (...,) between segments p0–p1 and q0–q1, all (..., 3), broadcast; a segment may be a point.
+    """Return least distances (...,) between segments p0–p1 and q0–q1, (..., 3), broadcast; points are segments too.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
@@ -142,7 +142,7 @@ def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
 
 
 def segment_box_distance_m(p0: Array, p1: Array, half_extent_m: Array) -> Array:
-    """Least distance (...,) of segments p0–p1 (..., 3) to the box of ± half extents (3,) at the origin; 0 inside.
+    """Return least distances (...,) of segments p0–p1 (..., 3) to a box of ± half extents (3,) at 0; 0 inside.
 
     The distance to a convex body is convex along a segment, so ternary search finds its minimum, to a micrometre on
     segments of a metre.
@@ -183,14 +183,14 @@ _SEED = 7  # the same question always has the same answer
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """Where an arm may be: the clearance that it must keep from everything, itself included."""
+    """The space in which an arm may be: the clearance that it must keep from everything, itself included."""
 
     body: ArmBody
     obstacles: Obstacles
     margin_m: float
 
     def obstruction(self, joints_rad: Array) -> str:
-        """What it would come too near to at the worst of the joints (K, N), in words; "" if it keeps clear."""
+        """Name what it would come too near to at the worst of the joints (K, N); "" if it keeps clear."""
         if not len(joints_rad):
             return ""
         contacts = nearest_contacts(self.body, self.obstacles, joints_rad)
@@ -198,12 +198,12 @@ class Freedom:
         return str(worst) if worst.clearance_m < self.margin_m else ""
 
     def obstruction_between(self, start_rad: Array, end_rad: Array) -> str:
-        """What blocks the straight way between two joints (N,). The ends are free, or the arm is there already."""
+        """Name what blocks the straight path between joints (N,). The ends are free, or the arm is already there."""
         return self.obstruction(straight_path(start_rad, end_rad, PATH_STEP_RAD)[1:-1])
 
 
 def detour(start_rad: Array, end_rad: Array, freedom: Freedom) -> Array | None:
-    """Joints (M, N) to go through from start to end (N,), each on a straight way; None if none was found.
+    """Return the joints (M, N) to go through from start to end (N,), each on a straight way; None if none was found.
 
     Two trees grow from the ends towards drawn joints and towards each other (RRT-Connect: Kuffner and LaValle, ICRA
     2000); the way is then shortened. It is deterministic. That none was found does not prove that there is none.
@@ -272,7 +272,7 @@ class _Tree:
         return len(self.parents) - 1
 
     def way_to(self, index: int) -> list[Array]:
-        """The joints from the first to this one."""
+        """Return the joints from the first to this one."""
         way: list[Array] = []
         while index >= 0:
             way.append(self.joints_rad[index])
@@ -281,7 +281,7 @@ class _Tree:
 
 
 def _shortened(way: Array, freedom: Freedom, rng: np.random.Generator) -> Array:
-    """The way (K, N) without joints that a straight way can leave out."""
+    """Return the way (K, N) without joints that a straight way can leave out."""
     for _ in range(_SHORTENINGS):
         if len(way) < 3:
             return way

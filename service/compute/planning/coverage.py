@@ -28,7 +28,7 @@ _LIFT_M = 0.002  # of points above the simplified surface, so that it does not o
 _BOARD_M = 0.004  # thickness of the layer that counts as the board
 _CLEAR_OF_SPHERES = 1.4  # radii
 _DOME_TILTS_DEG = (0.0, 20.0, 40.0, 55.0)
-_MARGIN_M = 0.08  # margin of surface kept around the spheres
+_MARGIN_M = 0.08  # margin of surface left around the spheres
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class CoverageSurface:
         return RayMeshIntersector(trimesh.Trimesh(self.occluder_vertices_m, self.occluder_faces, process=False))
 
     def free(self, origins: Array, target: Array) -> NDArray[np.bool_]:
-        """(K,) whether the line from origins (K, 3) to `target` (3,) or targets (K, 3) is unobstructed."""
+        """Return (K,) whether the line from origins (K, 3) to `target` (3,) or targets (K, 3) is unobstructed."""
         if self.rays is None or len(origins) == 0:
             return np.ones(len(origins), dtype=bool)
         return ~np.asarray(self.rays.intersects_any(origins, target - origins), dtype=bool)
@@ -115,7 +115,7 @@ def seen(
     T_scan_camera: Transform | None = None,
     camera: CameraModel | None = None,
 ) -> NDArray[np.bool_]:
-    """(N,) points that a camera at `eye_m` (3,) sees at a good angle; with a camera, only those in its image."""
+    """Return (N,) points that a camera at `eye_m` (3,) sees at a good angle; with a camera, those in its image."""
     way = eye_m - surface.points_m
     distance = np.linalg.norm(way, axis=1)
     facing = np.einsum("ni,ni->n", way, surface.normals) / distance
@@ -132,19 +132,19 @@ def seen(
 
 
 def covered_fraction(views: Sequence[NDArray[np.bool_]], min_views: int) -> float:
-    """Share of the points seen in at least `min_views` of the views (N,); 0 without views."""
+    """Return the share of the points seen in at least `min_views` of the views (N,); 0 without views."""
     if not views:
         return 0.0
     return float(np.mean(np.sum(views, axis=0) >= min_views))
 
 
 def _all_near(near: NDArray[np.bool_], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """(F,) whether all corners of a face are near."""
+    """Return (F,) whether all corners of a face are near."""
     return near[faces[:, 0]] & near[faces[:, 1]] & near[faces[:, 2]]
 
 
 def _up(spheres_m: Array, surface: Surface) -> Array:
-    """Unit vector (3,) away from the board, on which the spheres stand: most surface around them is the board's."""
+    """Return the unit vector (3,) away from the spheres' board: most of the surface around them is the board's."""
     normal = np.linalg.svd(spheres_m - spheres_m.mean(axis=0))[2][2]
     total = np.zeros(3)
     for block in surface.blocks():
@@ -161,7 +161,7 @@ def _plane_axes(up: Array) -> Array:
 
 
 def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDArray[np.bool_]:
-    """Points within the hull of the spheres as seen from above, and not on a sphere or its post."""
+    """Return the points within the hull of the spheres as seen from above, and not on a sphere or its post."""
     axes = _plane_axes(up)
     flat, feet = points @ axes.T, spheres_m @ axes.T
     hull = ConvexHull(feet)
@@ -174,7 +174,7 @@ def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDA
 
 
 def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArray[np.bool_]:
-    """Points on the plane under the specimen, if one height dominates among the level surfaces."""
+    """Return the points on the plane under the specimen, if one height dominates among the level surfaces."""
     height = (points - centre) @ up
     level = normals @ up > 0.97  # only the top: the underside has the same area
     if level.sum() < 50:
@@ -189,7 +189,7 @@ def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArra
 
 
 def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
-    """Eye positions on a dome of directions around the centre."""
+    """Return the eye positions on a dome of directions around the centre."""
     axes = _plane_axes(up)
     eyes: list[Array] = []
     for tilt in np.radians(_DOME_TILTS_DEG):
@@ -201,7 +201,7 @@ def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
 
 
 def _simplified(surface: Surface) -> tuple[Array, NDArray[np.int64]]:
-    """The mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast.
+    """Return the mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast.
 
     A cell has the place of its vertex that comes first in the faces.
     """

@@ -1,4 +1,4 @@
-"""Guidance for a hand-held camera: the wanted places, and words that lead from the current one to them.
+"""Guides a hand-held camera: the wanted places, and the text that leads from the current one to them.
 
 The level frame is in the middle of the scene: z up, y in the direction in which the first image's top pointed, so
 that the person stood at −y. A camera's attitude is `turn` about z, `lean` of its right side down and `tilt` of its
@@ -32,14 +32,14 @@ class Attitude:
 
     @classmethod
     def of(cls, R_level_camera: Array) -> Attitude:
-        """The attitude of a rotation matrix R_level_camera (3, 3)."""
+        """Return the attitude of a rotation matrix R_level_camera (3, 3)."""
         x, z = R_level_camera[:, 0], R_level_camera[:, 2]
         turn, lean = float(np.arctan2(x[1], x[0])), float(np.arcsin(np.clip(-x[2], -1.0, 1.0)))
         ahead = (Rotation.from_euler("z", turn) * Rotation.from_euler("y", lean)).inv().apply(z)
         return cls(turn, lean, float(np.arctan2(-ahead[2], ahead[1])))
 
     def matrix(self) -> Array:
-        """(3, 3) R_level_camera."""
+        """Return (3, 3) R_level_camera."""
         turned = Rotation.from_euler("z", self.turn_rad) * Rotation.from_euler("y", self.lean_rad)
         return np.asarray((turned * Rotation.from_euler("x", -self.tilt_rad)).as_matrix() @ _FORWARD)
 
@@ -54,7 +54,7 @@ class WantedView:
 
 
 def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
-    """T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along the level part of `top` (3,)."""
+    """Return T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along the level part of `top` (3,)."""
     z = up / np.linalg.norm(up)
     y = top - z * (top @ z)
     if np.linalg.norm(y) < 1e-6:
@@ -64,7 +64,7 @@ def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
 
 
 def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
-    """The normal (3,) of the best plane through the spheres (M, 3), towards the camera at `eye_m` (3,)."""
+    """Return the normal (3,) of the best plane through the spheres (M, 3), towards the camera at `eye_m` (3,)."""
     middle = spheres_m.mean(axis=0)
     normal = np.linalg.svd(spheres_m - middle)[2][2]
     return np.asarray(normal if (eye_m - middle) @ normal > 0 else -normal, dtype=np.float64)
@@ -73,13 +73,13 @@ def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
 def place_at(
     name: str, *, tilt_deg: float, azimuth_deg: float, distance_m: float, walk_round: bool, aim_m: Sequence[float]
 ) -> WantedView:
-    """A place on the hemisphere around the scene.
+    """Compute a place on the hemisphere around the scene.
 
     Args:
-        tilt_deg: of the line of sight from the vertical.
+        tilt_deg: angle of the line of sight from the vertical.
         azimuth_deg: 0 is the person's side, positive to the person's right.
-        distance_m: from `aim_m`.
-        walk_round: whether the person walks round the scene and the top of the image points away from the person;
+        distance_m: distance from `aim_m`.
+        walk_round: true if the person walks round the scene and the top of the image points away from the person;
             otherwise it stays as in the first image.
         aim_m: (3,) point that the camera looks at, level frame.
     """
@@ -95,7 +95,7 @@ def place_at(
 
 
 def words(T_level_here: Transform, T_level_there: Transform) -> str:
-    """Words such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
+    """Return a text such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
 
     Both poses are in the level frame. Left, right, forward and back are those of a holder who looks in the direction
     of the image's top; the camera is first moved, then turned. Empty if there is nothing to change.
@@ -126,7 +126,7 @@ def _angle(radians: float, verb: str, positive: str, negative: str) -> str:
 
 
 def covered(places: Iterable[WantedView], T_level_cameras: Sequence[Transform], within_deg: float) -> set[str]:
-    """Names of the places that an image covers: position and axis agree within `within_deg`."""
+    """Return the names of the places that an image covers: position and axis agree within `within_deg`."""
     limit = np.cos(np.deg2rad(within_deg))
     done: set[str] = set()
     for place in places:
@@ -141,7 +141,7 @@ def covered(places: Iterable[WantedView], T_level_cameras: Sequence[Transform], 
 
 
 def nearest(places: Iterable[WantedView], T_level_here: Transform) -> WantedView:
-    """The place with the shortest way from here, a radian of rotation counting as 40 cm. `places` is not empty."""
+    """Return the place nearest to here, a radian of rotation counting as 40 cm. `places` is not empty."""
 
     def way(place: WantedView) -> float:
         moved = float(np.linalg.norm(place.T_level_camera[:3, 3] - T_level_here[:3, 3]))
@@ -152,6 +152,6 @@ def nearest(places: Iterable[WantedView], T_level_here: Transform) -> WantedView
 
 
 def same_view(T_a: Transform, T_b: Transform, apart_m: float, apart_rad: float) -> bool:
-    """Whether two camera poses in one frame are so near that the second image adds nothing."""
+    """Return whether two camera poses in one frame are so near that the second image adds nothing."""
     T = inverse(T_a) @ T_b
     return bool(np.linalg.norm(T[:3, 3]) < apart_m and Rotation.from_matrix(T[:3, :3]).magnitude() < apart_rad)

@@ -25,7 +25,7 @@ class DepthOfField:
 def depth_of_field(
     focal_length_m: float, aperture_f: float, focus_distance_m: float, circle_of_confusion_m: float
 ) -> DepthOfField:
-    """Near and far limit for a thin lens focused at a distance from its entrance pupil.
+    """Compute near and far limit, in metres, for a thin lens focused at a distance from its entrance pupil.
 
     With H = f² / (N c) + f: near = s (H − f) / (H + s − 2 f), far = s (H − f) / (H − s).
     Source: S. F. Ray, Applied Photographic Optics, 3rd ed. 2002, chapter 22.
@@ -37,7 +37,7 @@ def depth_of_field(
 
 
 def depths_m(T_base_camera: Transform, points_base_m: Array) -> tuple[float, float]:
-    """Least and greatest depth along the optical axis of points (N, 3) in base coordinates, metres."""
+    """Return the least and greatest depth along the optical axis of points (N, 3) in base coordinates, metres."""
     depth = apply(inverse(T_base_camera), points_base_m)[:, 2]
     return float(np.min(depth)), float(np.max(depth))
 
@@ -73,7 +73,7 @@ class PlanningScene:
 
     @property
     def freedom(self) -> Freedom:
-        """Where the arm may be."""
+        """The space in which the arm may be."""
         return Freedom(self.body, self.obstacles, self.margin_m)
 
 
@@ -170,7 +170,7 @@ def plan_motion(
 
 
 def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, scene: PlanningScene) -> str:
-    """Why a pose cannot be taken; "" if it can."""
+    """Return why a pose cannot be taken; "" if it can."""
     if joints_rad is None:
         return "the arm does not reach it"
     contact = nearest_contacts(scene.body, scene.obstacles, joints_rad[None])[0]
@@ -189,7 +189,7 @@ def _blurred(T_base_camera: Transform, scene: PlanningScene) -> str:
 
 
 def travel_times_s(joints_rad: Array, scene: PlanningScene) -> Array:
-    """(K, K) time between joint positions (K, N), by the joint that turns farthest: ramp up, constant, ramp down."""
+    """Return (K, K) times between joint positions (K, N), by the farthest turn: ramp up, constant, ramp down."""
     distance = np.zeros((len(joints_rad), len(joints_rad)))
     for turns in joints_rad.T:
         np.maximum(distance, np.abs(turns[:, None] - turns[None]), out=distance)
@@ -197,19 +197,19 @@ def travel_times_s(joints_rad: Array, scene: PlanningScene) -> Array:
 
 
 def _legs_s(joints_rad: Array, scene: PlanningScene) -> Array:
-    """(K - 1,) time from each of the joint positions (K, N) to the next."""
+    """Return (K - 1,) time from each of the joint positions (K, N) to the next."""
     turns = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
     return turn_times_s(turns, scene.speed_rad_s, scene.acceleration_rad_s2)
 
 
 def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: float) -> Array:
-    """Time for joints to turn by angles of any shape: ramp up, constant speed if reached, ramp down."""
+    """Return the time for joints to turn by angles of any shape: ramp up, constant speed if reached, ramp down."""
     v, a = speed_rad_s, acceleration_rad_s2
     return np.where(turns_rad > v**2 / a, turns_rad / v + v / a, 2 * np.sqrt(turns_rad / a))
 
 
 def shortest_order(times_s: Array, working: Callable[[], None] = lambda: None) -> list[int]:
-    """A short open path from node 0 through all others, for times (K + 1, K + 1); indices 0 … K − 1 of the others.
+    """Find a short open path from node 0 through all others, for times (K + 1, K + 1); indices 0 … K − 1 of them.
 
     Starts from the better of the listed order and the nearest-neighbour order and improves it by 2-opt until no
     reversal helps. It is deterministic and never longer than the listed order. `working` is called again and again.
@@ -258,7 +258,7 @@ def _length(path: Sequence[int], times_s: Array) -> float:
 
 
 def _place(name: str, T_base_camera: Transform, best: Array | None, scene: PlanningScene) -> PlannedView:
-    """The view with its best posture (N,); without one, turned until there is one, or refused."""
+    """Return the view with its best posture (N,); without one, turned until there is one, or refused."""
     if best is not None:
         return PlannedView(name, T_base_camera, "feasible", joints_rad=best)
     nearest = next(iter(_postures(T_base_camera, scene)), None)
@@ -272,20 +272,20 @@ def _place(name: str, T_base_camera: Transform, best: Array | None, scene: Plann
 
 
 def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: float) -> Transform:
-    """The camera pose turned about the vertical through the scene's centre."""
+    """Return the camera pose turned about the vertical through the scene's centre."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return transform(R, centre_m - R @ centre_m) @ T_base_camera
 
 
 def _postures(T_base_camera: Transform, scene: PlanningScene) -> Array:
-    """Joints (K, N) that reach a pose, those nearest to the arm's current ones first."""
+    """Return the joints (K, N) that reach a pose, those nearest to the arm's current ones first."""
     T_base_flange = T_base_camera @ inverse(scene.body.T_flange_camera)
     return postures_near(scene.body.model, T_base_flange, scene.start_rad)
 
 
 def able_postures(T_base_camera: Transform, scene: PlanningScene) -> Iterator[Array]:
-    """Joints (N,) that reach a pose free of collisions and in focus, the best ones first.
+    """Yield the joints (N,) that reach a pose free of collisions and in focus, the best ones first.
 
     With six axes these are nearest to the arm's current ones. With seven, whose elbow is free, more clearance also
     counts, among postures about equally near.
@@ -299,7 +299,7 @@ def able_postures(T_base_camera: Transform, scene: PlanningScene) -> Iterator[Ar
 
 
 def _able(postures_rad: Array, clearances_m: Array, scene: PlanningScene) -> Iterator[Array]:
-    """Those of the postures (K, N), with clearances (K,), that have enough of it, the best ones first."""
+    """Yield those of the postures (K, N), with clearances (K,), that have enough of it, the best ones first."""
     order = range(len(postures_rad))
     if scene.body.model.axes > 6:  # the elbow is free
         tight = np.clip(1 - (clearances_m - scene.margin_m) / _ROOM_M, 0, None)
@@ -309,13 +309,13 @@ def _able(postures_rad: Array, clearances_m: Array, scene: PlanningScene) -> Ite
 
 
 def _clearances_m(postures_rad: Array, scene: PlanningScene) -> Array:
-    """The clearance (K,) at each of the postures (K, N)."""
+    """Return the clearance (K,) at each of the postures (K, N)."""
     contacts = nearest_contacts(scene.body, scene.obstacles, postures_rad)
     return np.array([contact.clearance_m for contact in contacts])
 
 
 def best_postures(T_base_camera: Sequence[Transform], scene: PlanningScene) -> list[Array | None]:
-    """`best_posture` of each of several poses, whose postures are checked together, which takes less time."""
+    """Find `best_posture` of each of several poses, whose postures are checked together, which takes less time."""
     found = [_postures(T, scene) for T in T_base_camera]
     first = [postures_rad[:_AT_ONCE] for postures_rad in found]
     ends = np.cumsum([len(some) for some in first])[:-1]
@@ -328,18 +328,18 @@ def best_postures(T_base_camera: Sequence[Transform], scene: PlanningScene) -> l
 
 
 def best_posture(T_base_camera: Transform, scene: PlanningScene) -> Array | None:
-    """The best of `able_postures`; None if there is none."""
+    """Return the best of `able_postures`; None if there is none."""
     return next(able_postures(T_base_camera, scene), None)
 
 
 def _other_way(here: Array, view: PlannedView, scene: PlanningScene) -> Array | None:
-    """Joints (N,) of another posture for a view that can be reached straight from `here`; None if there is none."""
+    """Find joints (N,) of another posture for a view, reached straight from `here`; None if there is none."""
     others = islice(able_postures(view.T_base_camera, scene), 1, _MOST_WAYS)
     return next((q for q in others if not scene.freedom.obstruction_between(here, q)), None)
 
 
 def _round_about(here: Array, view: PlannedView, scene: PlanningScene) -> PlannedView:
-    """The view with a detour from `here`, in the first of its postures to which one is found; else as it is."""
+    """Return the view with a detour from `here`, in its first posture to which one is found; else as it is."""
     for joints_rad in islice(able_postures(view.T_base_camera, scene), _ROUND_POSTURES):
         between = detour(here, joints_rad, scene.freedom)
         if between is not None:

@@ -37,15 +37,15 @@ def view_information(
     centre_m: Array,
     pose_sigma_m: float,
 ) -> ViewInformation:
-    """Information of one image's assigned outlines about T_base_scan, linearised there.
+    """Compute the information of one image's assigned outlines about T_base_scan, linearised there.
 
     Args:
         T_base_camera: pose of the camera.
-        T_base_scan: where it is linearised.
-        outlines: of the image.
+        T_base_scan: the pose at which it is linearised.
+        outlines: the image's outlines.
         markers: outline → sphere.
-        spheres: in the scan frame.
-        centre_m: (3,) base frame.
+        spheres: the spheres in the scan frame.
+        centre_m: (3,) centre of the scene, base frame.
         pose_sigma_m: the arm's nominal scatter; outlines that contradict the solution by much more are excluded.
     """
     base = apply(T_base_scan, spheres.centres_m)
@@ -67,7 +67,7 @@ def view_information(
 def predicted_information(
     T_base_camera: Transform, spheres_base_m: Array, radius_m: float, centre_m: Array, cone_covariance: Array
 ) -> Array:
-    """Information (6, 6) predicted for a view of spheres (K, 3) with outlines of this covariance (3, 3)."""
+    """Predict the information (6, 6) of a view of spheres (K, 3) with outlines of this covariance (3, 3)."""
     normal = np.zeros((6, 6))
     weight = np.linalg.inv(cone_covariance)
     for sphere in spheres_base_m:
@@ -80,7 +80,7 @@ def predicted_information(
 def cone_rows(
     T_base_camera: Transform, sphere_base_m: Array, centre_m: Array, radius_m: float, seen: Cone
 ) -> tuple[Array, Array]:
-    """Residual (3,) in radians of a sphere's cone as seen, and its derivative (3, 6) by (d, w)."""
+    """Return the residual (3,) in radians of a sphere's cone as seen, and its derivative (3, 6) by (d, w)."""
     c = apply(inverse(T_base_camera), sphere_base_m)
     residual, by_centre = ObservedCones.of([seen]).residuals(c[None], radius_m)
     move = T_base_camera[:3, :3].T @ np.hstack([np.eye(3), -skew(sphere_base_m - centre_m)])  # (3, 6) of c
@@ -88,7 +88,7 @@ def cone_rows(
 
 
 def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: float) -> Array:
-    """Covariance P (6, 6) of a station's camera poses, from the views' scatter and the nominal scatter.
+    """Return the covariance P (6, 6) of a station's camera poses, from the views' scatter and the nominal scatter.
 
     Args:
         views: their offsets scatter by the arm's error and the noise of their outlines.
@@ -104,7 +104,7 @@ def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: fl
 
 
 def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
-    """Covariance (6, 6) of the scan's pose from views with these informations (6, 6) and pose errors P each.
+    """Return the covariance (6, 6) of the scan's pose from views with these informations and pose errors P each.
 
     Raises:
         ComputeError: the views together do not determine the pose.
@@ -125,11 +125,11 @@ def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
 def mounting_covariance(
     views: Iterable[tuple[Array, Transform]], T_flange_camera: Transform, covariance: Array, centre_m: Array
 ) -> Array:
-    """Covariance (6, 6) of the scan's pose due to the uncertain camera mount, which all views share.
+    """Return the covariance (6, 6) of the scan's pose due to the uncertain camera mount, which all views share.
 
     Args:
         views: information (6, 6) and T_base_camera of each; together they must determine the pose.
-        covariance: (6, 6) of T_flange_camera, as (d, w) in flange axes with R → exp(w) R, t → t + d.
+        covariance: (6, 6) covariance of T_flange_camera, as (d, w) in flange axes with R → exp(w) R, t → t + d.
         centre_m: (3,) base frame.
     """
     normal, moved = np.zeros((6, 6)), np.zeros((6, 6))
@@ -146,7 +146,7 @@ def mounting_covariance(
 def lens_covariance_of_pose(
     views: Iterable[tuple[Array, Transform]], camera: CameraModel, covariance: Array, centre_m: Array
 ) -> Array:
-    """Covariance (6, 6) of the scan's pose due to the uncertain calibration, which all views share.
+    """Return the covariance (6, 6) of the scan's pose due to the uncertain calibration, which all views share.
 
     A focal length too long by a share puts the scan nearer by this share of its distance, and a principal point that
     is off puts it aside.
@@ -154,7 +154,8 @@ def lens_covariance_of_pose(
     Args:
         views: information (6, 6) and T_base_camera of each; together they must determine the pose.
         camera: intrinsics.
-        covariance: (4, 4) of fx, fy, cx, cy or (8, 8) with the distortion, which counts for nothing at the centre.
+        covariance: (4, 4) covariance of fx, fy, cx, cy or (8, 8) with the distortion, which counts for nothing at the
+            centre.
         centre_m: (3,) base frame.
     """
     normal, moved = np.zeros((6, 6)), np.zeros((6, 4))
@@ -171,7 +172,7 @@ def lens_covariance_of_pose(
 
 
 def point_sigmas_m(covariance: Array, points_m: Array) -> Array:
-    """Standard deviation (N,) in 3D, metres, at points (N, 3) from the centre, for a covariance (6, 6) of (d, w)."""
+    """Return 3D sigmas (N,), metres, at points (N, 3) from the centre, for a covariance (6, 6) of (d, w)."""
     J = place_jacobian(points_m)
     return np.sqrt(np.einsum("nij,jk,nik->n", J, covariance, J))
 
@@ -201,7 +202,7 @@ class CurrentInformation:
     shared: Array | None = field(default=None, repr=False)  # (6, 6) covariance that further views do not reduce
 
     def error_m(self, *more: Array) -> float:
-        """Predicted error of the worst target, m, with this further information added; infinite if undetermined."""
+        """Predict the worst target's error, m, with this further information added; infinite if undetermined."""
         try:
             covariance = pose_covariance([*self.informations, *more], self.pose_covariance)
         except ComputeError:
@@ -228,7 +229,7 @@ def next_best_views(
     min_coverage: float,
     at_most: int = 6,
 ) -> tuple[Suggestion, ...]:
-    """The shortest greedy list of viewpoints that brings error and coverage within limits, or `at_most` of them.
+    """Choose a short list of viewpoints greedily that brings error and coverage within limits, or `at_most` of them.
 
     While the error exceeds its limit, each choice minimises it; among equals, the one with the largest coverage, then
     the nearest wins. After that, each choice maximises coverage.
@@ -262,7 +263,7 @@ def _covered(count: NDArray[np.int64], min_views: int) -> float:
 
 
 def _gain(count: NDArray[np.int64], seen: NDArray[np.bool_], min_views: int) -> float:
-    """Progress of all points towards `min_views`, so that a first view of a point counts too."""
+    """Return the progress of all points towards `min_views`, so that a first view of a point counts too."""
     if not len(count):
         return 0.0
     return float(np.mean(np.minimum(count + seen, min_views) - np.minimum(count, min_views))) / min_views

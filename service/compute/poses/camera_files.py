@@ -38,7 +38,7 @@ _SIMULATED = "simulated"  # of a camera that a simulated rig had
 
 
 def read_camera_json(path: Path) -> CameraModel:
-    """Camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
+    """Read a camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (OpenCV).
 
     A file written by `calibrate intrinsics` also holds the calibration's results, and one of a simulated data set
     says so. Any other key is refused, since it could change the meaning of the numbers.
@@ -65,13 +65,13 @@ def read_camera_json(path: Path) -> CameraModel:
 
 
 def write_camera_json(path: Path, camera: CameraModel, *, simulated: bool = False) -> None:
-    """Write a camera in the form that `read_camera_json` reads."""
+    """Write a camera in the format that `read_camera_json` reads."""
     mark = {_SIMULATED: True} if simulated else {}
     path.write_text(json.dumps(mark | camera.record(), indent=2) + "\n", encoding="utf-8")
 
 
 def read_spheres_json(path: Path) -> ScanSpheres:
-    """Spheres in the scan frame, from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
+    """Read scan-frame spheres from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
 
     `details`, which the `spheres` command adds for each sphere, is ignored.
 
@@ -108,7 +108,7 @@ def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file.
+    """Return the object in a JSON file.
 
     Raises:
         DataError: the file is not JSON, or holds no object.
@@ -120,7 +120,7 @@ def json_object(path: Path) -> dict[str, Any]:
 
 
 def finite_numbers(value: object, where: str) -> Array:
-    """An array of finite numbers from parsed JSON.
+    """Return an array of finite numbers from parsed JSON.
 
     Raises:
         DataError: it is none; `where` names the place.

@@ -30,7 +30,7 @@ HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre,
 
 
 def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Transform]:
-    """T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
+    """Read T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
 
     Args:
         path: file or folder; its kind determines the format.
@@ -62,7 +62,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
 
 
 def _transforms_in(folder: Path) -> Path | None:
-    """The transforms.json of a folder, by this name or another that NeuS2 and Blender's data sets give it.
+    """Return the transforms.json of a folder, by this name or another that NeuS2 and Blender's data sets give it.
 
     Raises:
         DataError: there are several.
@@ -82,10 +82,10 @@ def _transforms_in(folder: Path) -> Path | None:
 def posed_images(
     path: Path, images: ImageFolder, folder: Path, *, strict: bool = False
 ) -> tuple[dict[str, Transform], ImageFolder]:
-    """T_world_camera by name for the images that have a pose, and these images; the others are left out.
+    """Read T_world_camera by name for the images that have a pose; return these images too, without the others.
 
     Raises:
-        DataError: as `read_poses`; no image has a pose; or, with `strict`, one has none.
+        DataError: `read_poses` fails; no image has a pose; or, with `strict`, one has none.
     """
     chosen, _ = _matched(read_poses(path), [file.name for file in images.files], path)
     return chosen, only_posed(images, chosen, path, folder, strict=strict)
@@ -94,7 +94,7 @@ def posed_images(
 def only_posed(
     images: ImageFolder, posed: Collection[str], path: Path, folder: Path, *, strict: bool = False
 ) -> ImageFolder:
-    """The images whose names are among those with a pose in the file `path`; the others are left out.
+    """Return the images whose names are among those with a pose in the file `path`; the others are left out.
 
     Raises:
         DataError: no image has a pose; or, with `strict`, one has none.
@@ -119,10 +119,10 @@ def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -
 def _matched(
     poses: Mapping[str, Transform], images: Sequence[str], path: Path
 ) -> tuple[dict[str, Transform], list[str]]:
-    """Poses by image, and the names of the images without one.
+    """Match poses to images; return the names of the images without one too.
 
     Raises:
-        DataError: as `matched_names`, or none of the images has one.
+        DataError: `matched_names` fails, or none of the images has one.
     """
     names = matched_names(images, poses, str(path))
     if images and not names:
@@ -147,10 +147,10 @@ def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> 
 
 
 def read_poses_csv(path: Path) -> dict[str, Transform]:
-    """T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
+    """Read T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
 
     Raises:
-        DataError: the file has another form; the message names file:line.
+        DataError: the file has another format; the message names file:line.
     """
     poses: dict[str, Transform] = {}
     rows = csv_rows(path)
@@ -186,7 +186,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
 
 
 def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None:
-    """Write poses in the form that `read_poses_csv` reads."""
+    """Write poses in the format that `read_poses_csv` reads."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(_HEADER)
@@ -199,9 +199,9 @@ def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None
 
 
 def read_transforms_json(path: Path) -> dict[str, Transform]:
-    """T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
+    """Read T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
 
-    Cameras look along -z, but those of NeuS2's own form and of Mitsuba along +z. Names are the frames' file_path
+    Cameras look along -z, but those of NeuS2's own format and of Mitsuba along +z. Names are the frames' file_path
     without a leading "./". Where `unit_box.json` of our own export lies beside it, positions are taken back to the
     world.
 
@@ -231,7 +231,7 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
 
 
 def _camera_axes(document: Mapping[str, Any]) -> Transform:
-    """The axes of a file's cameras, as `nerf_matrix_to_ngp` of NeuS2 and Instant-NGP takes them.
+    """Return the axes of a file's cameras, as `nerf_matrix_to_ngp` of NeuS2 and Instant-NGP takes them.
 
     They test only whether the keys are there: with `from_na` x is right, y down, z forward, with `normal_mts_args`
     (Mitsuba) x is left, y up, z forward.
@@ -242,7 +242,7 @@ def _camera_axes(document: Mapping[str, Any]) -> Transform:
 
 
 def _centre_beside(path: Path) -> Array:
-    """The centre (3,) that our own exporters of the unit box subtracted from the positions, in metres; else zero."""
+    """Return the centre (3,), in metres, that our unit box exporters subtracted from the positions; else zero."""
     beside = path.parent / "unit_box.json"
     if not beside.is_file():
         return np.zeros(3)
@@ -253,7 +253,7 @@ def _centre_beside(path: Path) -> Array:
 
 
 def _rotation(matrix: Array, where: str) -> Array:
-    """The rotation matrix nearest to one that was written with few digits."""
+    """Return the rotation matrix nearest to one that was written with few digits."""
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > 5 * _UNIT or np.linalg.det(matrix) < 0:
         raise DataError(
             "the matrix is not a rotation (scaled, sheared or mirrored)",
@@ -286,7 +286,7 @@ def write_transforms_json(
 
 
 def transforms_intrinsics(camera: CameraModel, *, where: str = "", remedy: str) -> dict[str, float]:
-    """The keys of one camera in transforms.json; nerfstudio, like COLMAP, has the first pixel's corner at 0.
+    """Return the keys of one camera in transforms.json; nerfstudio, like COLMAP, has the first pixel's corner at 0.
 
     Raises:
         DataError: the camera has the rational distortion k4, k5, k6, which the format cannot hold.
@@ -312,7 +312,7 @@ def transforms_intrinsics(camera: CameraModel, *, where: str = "", remedy: str) 
 
 
 def read_colmap_model(folder: Path) -> dict[str, Transform]:
-    """T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
+    """Read T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
 
     Raises:
         DataError: the folder has no model, or it cannot be read.
@@ -332,7 +332,7 @@ _COLUMNS = 8
 
 
 def _is_trajectory(table: TextTable) -> bool:
-    """Whether a table has eight numbers in its first line, separated by spaces, and so no header and no names."""
+    """Return whether a table's first line is eight numbers separated by spaces, and so no header and no names."""
     if not table.rows or table.dialect.separator != " ":
         return False
     cells = table.rows[0].cells
@@ -340,10 +340,10 @@ def _is_trajectory(table: TextTable) -> bool:
 
 
 def _trajectory_poses(table: TextTable, path: Path) -> dict[str, Transform]:
-    """T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
+    """Return T_world_camera by timestamp, as the file writes it: images of such data sets are named by it.
 
     Raises:
-        DataError: a line has another form, or a timestamp occurs twice; the message names file:line.
+        DataError: a line has another format, or a timestamp occurs twice; the message names file:line.
     """
     poses: dict[str, Transform] = {}
     for row in table.rows:
@@ -383,13 +383,13 @@ _NAMED = 3
 
 
 def matched_names(images: Sequence[str], named: Collection[str], where: str, *, what: str = "pose") -> dict[str, str]:
-    """For each image that a file names, its name there.
+    """Return, for each image that a file names, its name there.
 
     Args:
         images: names of image files.
         named: the names in the file.
         where: names the file in errors.
-        what: the file has of each image.
+        what: content that the file has of each image, for errors.
 
     Raises:
         DataError: a name in the file can be several images, or several names one image.
@@ -433,12 +433,12 @@ def _match(
 
 
 def _file(name: str) -> str:
-    """The file's name without its folders, whichever system wrote the path."""
+    """Return the file's name without its folders, whichever system wrote the path."""
     return PurePosixPath(_DRIVE.sub("", name.strip().replace("\\", "/"), count=1)).name
 
 
 def _composed(name: str) -> str:
-    """The file's name with composed letters: macOS stores ä as a and two dots."""
+    """Return the file's name with composed letters: macOS stores ä as a and two dots."""
     return unicodedata.normalize("NFC", _file(name))
 
 
@@ -451,5 +451,5 @@ def _stem(name: str) -> str:
 
 
 def some_names(names: Sequence[str]) -> str:
-    """The first names of several, for messages."""
+    """Return the first names of several, for messages."""
     return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

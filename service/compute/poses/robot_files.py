@@ -67,11 +67,11 @@ class RobotPoseTable:
     """The rows of a file of poses.
 
     Attributes:
-        names: of the images; None if the file has none.
-        position: (M, 3) as written.
-        rotation: (M, 3 or 4) as written.
-        form: what `rotation` is.
-        unit: of `position`.
+        names: names of the images; None if the file has none.
+        position: (M, 3) positions as written.
+        rotation: (M, 3 or 4) rotations as written.
+        form: format of `rotation`.
+        unit: unit of `position`.
         plain: the file says itself what it holds: names, and quaternions in metres.
     """
 
@@ -83,14 +83,14 @@ class RobotPoseTable:
     plain: bool
 
     def poses(self, form: RotationForm | None = None) -> Array:
-        """(M, 4, 4) poses with positions in metres, with the rotations in this form or the file's."""
+        """Return (M, 4, 4) poses with positions in metres, with the rotations in this format or the file's."""
         out = np.tile(np.eye(4), (len(self.position), 1, 1))
         out[:, :3, :3] = _matrices(self.rotation, form or self.form)
         out[:, :3, 3] = METRES_PER[self.unit] * self.position
         return out
 
     def other_readings(self) -> Iterator[tuple[Array, str, str]]:
-        """(M, 4, 4) poses by each other form of rotation, in words after "they fit", and what to do."""
+        """Yield (M, 4, 4) poses by each other format of rotation, a text after "they fit", and the advice."""
         for form in _forms(self.rotation.shape[1]):
             if form != self.form:
                 yield self.poses(form), f"with the rotations {_WORDS[form]}", f"Give --rotation {form}"
@@ -111,15 +111,15 @@ class RobotPoseTable:
 def read_robot_poses(
     path: Path, *, form: RotationForm | None = None, unit: LengthUnit | None = None
 ) -> RobotPoseTable:
-    """The table of poses in a file of delimited text.
+    """Read the table of poses in a file of delimited text.
 
     Args:
-        path: of the file.
-        form: of the rotations; None: by the header, the number of columns and the size of the numbers.
-        unit: of the positions; None: by the header, else metres.
+        path: the file.
+        form: format of the rotations; None: by the header, the number of columns and the size of the numbers.
+        unit: unit of the positions; None: by the header, else metres.
 
     Raises:
-        DataError: there is no pose, or a row has another form; the message names file:line.
+        DataError: there is no pose, or a row has another format; the message names file:line.
     """
     lines = [(line, _cells(row)) for line, row in csv_rows(path)]
     if not lines:
@@ -164,10 +164,10 @@ def read_robot_poses(
 
 
 def matched_rows(table: RobotPoseTable, images: Sequence[str], path: Path) -> dict[str, int]:
-    """The row of each image that has one: by name, or, without names, by the order of the numbers in the names.
+    """Find the row of each image that has one: by name, or, without names, by the order of the numbers in the names.
 
     Raises:
-        DataError: without names, there are more or fewer rows than images; with names, as `matched_names`.
+        DataError: the table has no names, and more or fewer rows than images; or `matched_names` fails.
     """
     if table.names is None:
         if len(table.position) != len(images):
@@ -182,7 +182,7 @@ def matched_rows(table: RobotPoseTable, images: Sequence[str], path: Path) -> di
 
 
 def other_orders(rows: Mapping[str, int]) -> Iterator[tuple[dict[str, int], str]]:
-    """The row of each image if the poses were put to the images in another order of the names, and it in words."""
+    """Yield the rows of the images if the poses followed another order of names, and the text for that order."""
     counted_up, spelt = sorted(rows, key=natural), sorted(rows)
     if counted_up != spelt:
         words = "if they were put to the images in the order {}"
@@ -192,7 +192,7 @@ def other_orders(rows: Mapping[str, int]) -> Iterator[tuple[dict[str, int], str]
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts names by the numbers in them: 2 before 10."""
+    """Return a key that sorts names by the numbers in them: 2 before 10."""
     return [
         (0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part
     ]
@@ -200,7 +200,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Where a table has its numbers, and what they are."""
+    """The columns in which a table has its numbers, and their meaning."""
 
     header: bool
     count: int
@@ -211,7 +211,7 @@ class _Columns:
 
 
 def _cells(row: Sequence[str]) -> list[str]:
-    """The cells of a row without p[ … ], as URScript writes a pose."""
+    """Return the cells of a row without p[ … ], as URScript writes a pose."""
     return [re.sub(r"^\s*(p?\[)|\]\s*$", "", cell).strip() for cell in row]
 
 
@@ -258,7 +258,7 @@ def _number(cell: str) -> float | None:
 
 
 def _bare(cell: str) -> str:
-    """A column's name without its unit: `X [mm]`, `x_mm` and `x(m)` are x."""
+    """Return a column's name without its unit: `X [mm]`, `x_mm` and `x(m)` are x."""
     return re.sub(r"([\s_]*[\[(].*|_(mm|cm|m|in|deg|rad))$", "", cell.strip().lower())
 
 
@@ -278,7 +278,7 @@ def _form(rotation: Array, wanted: RotationForm | None, stated: RotationForm | N
         )
     form: RotationForm = wanted or stated or possible[0]
     if wanted is None and form in ("rotvec", "rpy") and np.abs(rotation).max() > _TURN:
-        return "rpy-deg"  # of the forms in degrees the one that most programs write; the images tell
+        return "rpy-deg"  # of the formats in degrees the one that most programs write; the images decide
     return form
 
 
@@ -288,7 +288,7 @@ def _forms(numbers: int) -> tuple[RotationForm, ...]:
 
 
 def _matrices(rotation: Array, form: RotationForm) -> Array:
-    """(M, 3, 3) rotations."""
+    """Return (M, 3, 3) rotations."""
     return _MAKE[form.removesuffix("-deg")](np.radians(rotation) if form.endswith("-deg") else rotation).as_matrix()
 
 
@@ -307,7 +307,7 @@ _REMEDY = "Give the file that `orthocapture calibrate hand-eye` wrote"
 
 
 def read_hand_eye(path: Path) -> Transform:
-    """T_flange_camera (4, 4), metres, from a hand_eye.json.
+    """Read T_flange_camera (4, 4), metres, from a hand_eye.json.
 
     Raises:
         DataError: the file holds no valid T_flange_camera.
@@ -323,7 +323,7 @@ def read_hand_eye(path: Path) -> Transform:
 
 
 def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
-    """Station by image name, from a CSV with the columns image and station.
+    """Read the station by image name, from a CSV with the columns image and station.
 
     Raises:
         DataError: the columns are missing, or an image has no station.
@@ -357,10 +357,10 @@ _LARGEST_RAD = 4 * np.pi  # beyond any arm's range: the file is in degrees
 
 
 def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
-    """Joints (N,) in radians by image name; N is the number of columns q1, q2, …
+    """Read the joints (N,) in radians by image name; N is the number of columns q1, q2, …
 
     Raises:
-        DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.
+        DataError: the file is missing or malformed (with file:line), in degrees, or has no row for an image.
     """
     rows = csv_rows(path)
     header = tuple(cell.strip() for cell in next(rows, (1, []))[1])

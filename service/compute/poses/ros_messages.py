@@ -129,7 +129,7 @@ class StampedTransform:
 
 
 def encode_image(image: StampedImage) -> bytes:
-    """A sensor_msgs/CompressedImage."""
+    """Encode a sensor_msgs/CompressedImage."""
     out = CdrWriter()
     _write_header(out, image.stamp_ns, image.frame)
     out.text(image.form)
@@ -138,7 +138,7 @@ def encode_image(image: StampedImage) -> bytes:
 
 
 def decode_image(data: bytes) -> StampedImage:
-    """A sensor_msgs/CompressedImage. Raises CdrError."""
+    """Decode a sensor_msgs/CompressedImage. Raises CdrError."""
     read = CdrReader(data)
     stamp_ns, frame = _read_header(read)
     form = read.text()
@@ -146,7 +146,7 @@ def decode_image(data: bytes) -> StampedImage:
 
 
 def encode_camera_info(stamp_ns: int, frame: str, camera: CameraModel) -> bytes:
-    """A sensor_msgs/CameraInfo with OpenCV's distortion; pixel centres lie at integers, in ROS as here."""
+    """Encode a sensor_msgs/CameraInfo with OpenCV's distortion; pixel centres lie at integers, in ROS as here."""
     out = CdrWriter()
     _write_header(out, stamp_ns, frame)
     out.number("I", camera.height)
@@ -165,7 +165,7 @@ def encode_camera_info(stamp_ns: int, frame: str, camera: CameraModel) -> bytes:
 
 
 def decode_camera_info(data: bytes) -> CameraModel:
-    """The camera of a sensor_msgs/CameraInfo. Raises CdrError, also for a distortion that is not OpenCV's."""
+    """Decode the camera of a sensor_msgs/CameraInfo. Raises CdrError, also for a distortion that is not OpenCV's."""
     read = CdrReader(data)
     _read_header(read)
     height, width = read.integer("I"), read.integer("I")
@@ -183,13 +183,13 @@ def decode_camera_info(data: bytes) -> CameraModel:
 
 
 def encode_pose(stamp_ns: int, frame: str, T: Transform, covariance: Array) -> bytes:
-    """A geometry_msgs/PoseWithCovarianceStamped.
+    """Encode a geometry_msgs/PoseWithCovarianceStamped.
 
     Args:
-        stamp_ns: since 1970.
-        frame: in which the pose is.
+        stamp_ns: nanoseconds since 1970.
+        frame: frame in which the pose is.
         T: (4, 4) T_frame_body, metres.
-        covariance: (6, 6) of (d, w) in the axes of the frame, m and rad, as ROS has it.
+        covariance: (6, 6) covariance of (d, w) in the axes of the frame, m and rad, as ROS has it.
     """
     out = CdrWriter()
     _write_header(out, stamp_ns, frame)
@@ -199,14 +199,14 @@ def encode_pose(stamp_ns: int, frame: str, T: Transform, covariance: Array) -> b
 
 
 def decode_pose(data: bytes) -> StampedTransform:
-    """A geometry_msgs/PoseStamped, or one with a covariance, which is left out; `child` is "". Raises CdrError."""
+    """Decode a geometry_msgs/PoseStamped, or one with a covariance, left out; `child` is "". Raises CdrError."""
     read = CdrReader(data)
     stamp_ns, frame = _read_header(read)
     return StampedTransform(stamp_ns, frame, "", _read_transform(read))
 
 
 def encode_tf(transforms: list[StampedTransform]) -> bytes:
-    """A tf2_msgs/TFMessage."""
+    """Encode a tf2_msgs/TFMessage."""
     out = CdrWriter()
     out.number("I", len(transforms))
     for one in transforms:
@@ -217,7 +217,7 @@ def encode_tf(transforms: list[StampedTransform]) -> bytes:
 
 
 def decode_tf(data: bytes) -> list[StampedTransform]:
-    """A tf2_msgs/TFMessage. Raises CdrError."""
+    """Decode a tf2_msgs/TFMessage. Raises CdrError."""
     read = CdrReader(data)
     found: list[StampedTransform] = []
     for _ in range(read.sequence_length(_TF_BYTES)):
@@ -271,27 +271,27 @@ class CdrWriter:
         self._data = bytearray(_LITTLE)
 
     def bytes(self) -> bytes:
-        """The encoded message."""
+        """Return the encoded message."""
         return bytes(self._data)
 
     def number(self, code: str, value: float) -> None:
-        """A number with a code of the module struct: i, I, d, …"""
+        """Write a number with a code of the module struct: i, I, d, …"""
         self._align(struct.calcsize(code))
         self._data += struct.pack(f"<{code}", value)
 
     def text(self, value: str) -> None:
-        """A string, with its terminating zero."""
+        """Write a string, with its terminating zero."""
         encoded = value.encode() + b"\0"
         self.number("I", len(encoded))
         self._data += encoded
 
     def blob(self, value: bytes) -> None:
-        """A sequence of bytes."""
+        """Write a sequence of bytes."""
         self.number("I", len(value))
         self._data += value
 
     def doubles(self, values: Sequence[float] | NDArray[np.float64], *, sequence: bool) -> None:
-        """Doubles: an array of fixed length, or a sequence, which states its length."""
+        """Write doubles: an array of fixed length, or a sequence, which gives its length."""
         if sequence:
             self.number("I", len(values))
         for value in values:
@@ -311,15 +311,15 @@ class CdrReader:
         self._data, self._at = data, _HEAD
 
     def integer(self, code: str) -> int:
-        """A whole number with a code of the module struct."""
+        """Read a whole number with a code of the module struct."""
         return int(self._unpack(code, 1)[0])
 
     def doubles(self, count: int) -> NDArray[np.float64]:
-        """(count,) doubles."""
+        """Read (count,) doubles."""
         return np.array(self._unpack("d", count), dtype=np.float64)
 
     def text(self) -> str:
-        """A string."""
+        """Read a string."""
         raw = self.blob()
         if not raw.endswith(b"\0"):
             raise CdrError("a string does not end with a zero")
@@ -329,11 +329,11 @@ class CdrReader:
             raise CdrError("a string is not UTF-8") from error
 
     def blob(self) -> bytes:
-        """A sequence of bytes."""
+        """Read a sequence of bytes."""
         return self._take(self.integer("I"))
 
     def sequence_length(self, least_bytes: int) -> int:
-        """The length of a sequence whose elements take so many bytes at least."""
+        """Read the length of a sequence whose elements take so many bytes at least."""
         count = self.integer("I")
         if count * least_bytes > len(self._data) - self._at:
             raise CdrError(f"a sequence of {count} elements does not fit into the message")

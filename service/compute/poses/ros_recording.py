@@ -34,12 +34,13 @@ from service.core.units import ms, seconds_of_ns
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How a pose may be taken for a time that no message has.
+    """The rule by which a pose may be taken for a time that no message has.
 
     Attributes:
-        within_ns: the nearest message may be so far away.
-        interpolate: between the messages before and after, if these are not farther apart than `most_ns`.
-        most_ns: see `interpolate`.
+        within_ns: largest time to the nearest message.
+        interpolate: true to interpolate between the messages before and after, if these are not farther apart than
+            `most_ns`.
+        most_ns: largest time between these two messages.
     """
 
     within_ns: int = 0
@@ -94,16 +95,16 @@ class FrameTree:
         edge.poses.append(found.T_parent_child)
 
     def frames(self) -> tuple[str, ...]:
-        """The names of all frames, sorted."""
+        """Return the names of all frames, sorted."""
         return tuple(sorted({*self._edges, *(edge.parent for edge in self._edges.values())}))
 
     def is_static(self, a: str, b: str) -> bool:
-        """Whether two frames do not move against each other. Raises as `pose` does."""
+        """Return whether two frames do not move against each other. Raises as `pose` does."""
         up, down = self._between(a, b)
         return all(self._edges[child].static for child in (*up, *down))
 
     def pose(self, a: str, b: str, stamp_ns: int, timing: Timing) -> FoundPose:
-        """T_a_b at a time.
+        """Return T_a_b at a time.
 
         Raises:
             DataError: a frame is unknown, or the two are not connected.
@@ -120,7 +121,7 @@ class FrameTree:
         return FoundPose(inverse(T_top[0]) @ T_top[1], away, interpolated)
 
     def _between(self, a: str, b: str) -> tuple[list[str], list[str]]:
-        """The children on the ways from a and from b up to their lowest common frame."""
+        """Return the children on the ways from a and from b up to their lowest common frame."""
         ways = [self._upwards(a), self._upwards(b)]
         while ways[0] and ways[1] and ways[0][-1] == ways[1][-1]:
             ways = [ways[0][:-1], ways[1][:-1]]
@@ -181,7 +182,7 @@ def _chosen(edge: _Edge, child: str, stamp_ns: int, timing: Timing) -> FoundPose
 
 
 def _interpolated(T_before: Transform, T_after: Transform, share: float) -> Transform:
-    """The pose in between: the position on the line, the rotation about the axis that leads from one to the other."""
+    """Interpolate the pose: the position on the line, the rotation about the axis from one to the other."""
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second
 
     turned = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_before[:3, :3], T_after[:3, :3]])))(share)
@@ -206,12 +207,12 @@ _DAMAGES = (
 
 @dataclass
 class Recording:
-    """What a recording holds, except the images, which are passed on as they are read.
+    """The content of a recording, except the images, which are passed on as they are read.
 
     Attributes:
-        frames: of /tf and /tf_static.
-        poses: by topic of PoseStamped or PoseWithCovarianceStamped, in order of the file.
-        cameras: by topic of CameraInfo: the camera of its first message.
+        frames: transforms of /tf and /tf_static.
+        poses: poses by topic of PoseStamped or PoseWithCovarianceStamped, in order of the file.
+        cameras: the camera of its first message by topic of CameraInfo.
         image_topics: topics of compressed images.
         other: types of the topics that are not read, by topic.
     """
@@ -224,7 +225,7 @@ class Recording:
 
 
 def recording_file(path: Path) -> Path:
-    """The MCAP file of a recording, which may be given as the folder of rosbag2.
+    """Return the MCAP file of a recording, which may be given as the folder of rosbag2.
 
     Raises DataError if there is none, or more than one.
     """
@@ -293,7 +294,7 @@ def _take(
 
 
 def _messages(path: Path) -> Iterator[tuple[str, str, bytes]]:
-    """Topic, type and bytes of every message in CDR. Raises one of _DAMAGES, and OSError."""
+    """Yield the topic, type and bytes of every message in CDR. Raises one of _DAMAGES, and OSError."""
     try:
         from mcap.exceptions import McapError  # noqa: PLC0415 - optional
         from mcap.records import Channel, Message, Schema  # noqa: PLC0415
@@ -320,7 +321,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, bytes]]:
 
 
 def _records(path: Path) -> Iterator[Any]:
-    """The records of a file and of its chunks; the sizes that chunks state are checked before they are unpacked."""
+    """Yield the records of a file and of its chunks; the sizes of chunks are checked before they are unpacked."""
     from lz4.frame import get_frame_info  # noqa: PLC0415 - come with mcap
     from mcap.records import Chunk  # noqa: PLC0415
     from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
@@ -354,13 +355,13 @@ class _Bounded:
         self._file, self._left = file, size
 
     def read(self, count: int) -> bytes:
-        """At most so many bytes."""
+        """Read `count` bytes at most, and none beyond the size."""
         data = self._file.read(min(count, self._left))
         self._left -= len(data)
         return data
 
 
 def _plain(error: BaseException) -> str:
-    """The words of an error in one printable line."""
+    """Return the text of an error in one printable line."""
     text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return "".join(c if c.isprintable() else "?" for c in text)[:300]

@@ -1,1 +1,1 @@
-"""From outlines and camera poses to the pose of the scan: identification and registration."""
+"""Computes the pose of the scan from outlines and camera poses: identification and registration."""

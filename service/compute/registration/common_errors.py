@@ -29,13 +29,13 @@ _SIGMAS = 5.0
 # 0.8e-4, by what single outlines share: a calibration is not expected to be better.
 _EXPECTED_FOCAL = 0.5e-4
 _SHARP_PX = 0.7  # blur up to which the sizes of the common errors were measured; they grow with it
-_NAMED_BLUR = 1.3  # times that, from which blur is told
+_NAMED_BLUR = 1.3  # times that, from which blur is reported
 _LIGHT_OF_GROWTH = 2 / 3  # as in EXPECTED_COMMON_ERRORS
 # Clean rendered scenes gave at most 1.1e-4 with focal length and scale free.
 _EXPECTED_SCALE = 1e-4
 _SIGN_OF_SCALE = 2e-4  # from which the positions that the outlines prefer are a sign of another scale
 _AGREES = 3.0  # standard deviations
-_LEAST_POSITIONS = 4  # that tell a scale
+_LEAST_POSITIONS = 4  # that determine a scale
 
 CommonErrorName = Literal["shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y", "scale"]
 
@@ -55,24 +55,24 @@ class CommonError:
 
     @property
     def uncertainty(self) -> float:
-        """Standard deviation of the value as an error of the inputs, whose expected size it cannot be told from."""
+        """Standard deviation of the value as an error of the inputs: it includes their expected size."""
         return float(np.hypot(self.sigma, self.expected))
 
     @property
     def significant(self) -> bool:
-        """Whether it is larger than its uncertainty allows."""
+        """True if it is larger than its uncertainty allows."""
         return abs(self.value) > _SIGMAS * self.uncertainty
 
 
 @dataclass(frozen=True, slots=True)
 class BeyondModel:
-    """What the free fit tells.
+    """The result of the fit that leaves the errors common to all outlines free.
 
     Attributes:
         errors: the common errors as the outlines have them; empty if they do not determine them.
         blur_px: median blur of the outlines.
         component: (6, 6) covariance of T_world_scan for what the model does not explain; zero if it explains all.
-        findings: the causes, in words.
+        findings: texts of the causes.
     """
 
     errors: tuple[CommonError, ...]
@@ -94,13 +94,13 @@ def beyond_model(
     """Compare a registration with one that leaves the errors that all outlines share free.
 
     Args:
-        outlines: as for the registration.
-        assignments: as for the registration.
-        images: as for the registration.
-        spheres: as for the registration.
+        outlines: the registration's outlines.
+        assignments: the registration's assignments.
+        images: the registration's images.
+        spheres: the registration's spheres.
         held: the registration, with the common errors near zero and the camera as calibrated.
-        settings: of the registration.
-        lens_covariance: (8, 8) of the calibration; None if it is not stated.
+        settings: the registration's settings.
+        lens_covariance: (8, 8) covariance of the calibration; None if it is not given.
     """
     camera = images.camera
     blur_px = float(np.median([o.systematic_px for o in held.solution.problem.outlines])) / SYSTEMATIC_PER_BLUR
@@ -119,7 +119,7 @@ def beyond_model(
         scaled = _fitted(outlines, assignments, replace(images, metric=False), spheres, wide)
         told = () if scaled is None else _errors(scaled, images, common, lens_covariance)
         if any(e.significant for e in told if e.name == "scale") or _focal_length_is_off(told):
-            free, errors = scaled, told  # else the images cannot tell the two apart
+            free, errors = scaled, told  # else the images cannot separate the two
     significant: dict[CommonErrorName, CommonError] = {e.name: e for e in errors if e.significant}
     component = np.zeros((6, 6))
     if free is not None and significant:
@@ -139,7 +139,7 @@ def _fitted(
     spheres: ScanSpheres,
     settings: RegistrationSettings,
 ) -> RegistrationResult | None:
-    """The registration; None if the outlines do not determine so much."""
+    """Return the registration; None if the outlines do not determine so much."""
     try:
         return register(outlines, assignments, images, spheres, settings)
     except ComputeError:
@@ -151,7 +151,7 @@ def _focal_length_is_off(errors: Sequence[CommonError]) -> bool:
 
 
 def _scale_of_positions(held: RegistrationResult, images: PosedImages) -> float:
-    """By how much the outlines have the camera positions larger than given, at the station that differs most.
+    """Return the camera positions' scale by the outlines over the given one, at the station that differs most.
 
     An estimate that takes no time: poses that are trusted too much move less.
     """
@@ -166,15 +166,15 @@ def _scale_of_positions(held: RegistrationResult, images: PosedImages) -> float:
 
 
 def held_lens_covariance(uncertain: RegistrationResult, lens_covariance: Array, *, refined: bool = False) -> Array:
-    """(6, 6) covariance that a calibration's errors cause in T_world_scan if the camera is held as calibrated.
+    """Propagate a calibration's errors to T_world_scan, (6, 6), if the camera is held as calibrated.
 
-    Whole, not what the outlines leave of it, since the camera is not corrected: an error e of the lens moves the
-    unknowns by V e, V the regression of their errors on those of the lens.
+    The covariance is whole, not what the outlines leave of it, since the camera is not corrected: an error e of the
+    lens moves the unknowns by V e, V the regression of their errors on those of the lens.
 
     Args:
         uncertain: the registration with this covariance as a prior.
-        lens_covariance: (8, 8) of the calibration.
-        refined: whether the scan is meant relative to the cameras that the outlines refined.
+        lens_covariance: (8, 8) covariance of the calibration.
+        refined: true if the scan is meant relative to the cameras that the outlines refined.
     """
     problem, joint = uncertain.solution.problem, uncertain.solution.covariance
     lens = slice(problem.lens_column, problem.size)
@@ -208,7 +208,7 @@ def _errors(
 
 
 def _moved(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, ...]:
-    """(6,) perturbations of T_world_scan, against the cameras, from the one registration to the other.
+    """Return (6,) perturbations of T_world_scan, against the cameras, from the one registration to the other.
 
     Two, if their scales differ: the one holds if the positions are wrong, the other if the list is.
     """
@@ -226,7 +226,7 @@ def _moved(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, .
 
 
 def _light_px(growth: CommonError | None, blur_px: float, common: CommonErrors) -> float:
-    """The bias by light from one side that outlines of this blur and growth may have."""
+    """Return the bias by light from one side that outlines of this blur and growth may have."""
     if blur_px <= _SHARP_PX:
         return common.light_px
     by_growth = 0.0 if growth is None else _LIGHT_OF_GROWTH * abs(growth.value)
@@ -297,7 +297,7 @@ def _radius_px(held: RegistrationResult, f: float) -> float:
 def _contradicts_radius(
     scale: CommonError, growth: CommonError, radius_px: float
 ) -> Literal["list", "positions"] | None:
-    """Which of the two does not go with the spheres' radius, by the size of the outlines; None if that is open."""
+    """Return whether list or positions contradict the spheres' radius by the outlines' size; None if that is open."""
     grown, uncertainty = growth.value / radius_px, growth.uncertainty / radius_px
     with_list = abs(grown) <= _AGREES * uncertainty  # outlines as large as the list has them
     with_positions = abs(grown - scale.value) <= _AGREES * uncertainty

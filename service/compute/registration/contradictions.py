@@ -28,13 +28,13 @@ ContradictionKind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """One fault.
+    """A fault that the outlines show in the inputs of a registration.
 
     Attributes:
-        kind: of fault.
+        kind: the kind of fault.
         what: is wrong, in a sentence without its full stop.
-        remedy: what to do; where the data cannot tell causes apart, one for each.
-        refuses: whether the result must not be used before somebody has looked at this.
+        remedy: advice to the user; where the data cannot distinguish causes, advice for each.
+        refuses: true if the result must not be used before somebody has looked at this.
     """
 
     kind: ContradictionKind
@@ -43,7 +43,7 @@ class Contradiction:
     refuses: bool = False
 
 
-MOST_LEFT_OUT = 0.25  # share of the images: if more contradict one another, nothing tells which are wrong
+MOST_LEFT_OUT = 0.25  # share of the images: if more contradict one another, nothing shows which are wrong
 _TIMES_TYPICAL, _LEAST_PX = 5.0, 1.0  # of the other images' distance from the prediction
 _LEAST_SEEN, _SEEN_SHARE = 4, 0.3  # spheres that must be expected, and share of them that must be used
 _SAME_PLACE_M, _SAME_TURN_RAD = 5e-3, np.radians(1.0)  # of poses that are taken as one
@@ -56,13 +56,13 @@ def odd_images(
     spheres: ScanSpheres,
     registration: RegistrationResult,
 ) -> frozenset[int]:
-    """The images that contradict a registration of all of them.
+    """Find the images that contradict a registration of all of them.
 
     Args:
-        outlines: per image, all that were found in it.
-        images: with the poses as given.
+        outlines: all outlines that were found in each image.
+        images: the images with the poses as given.
         spheres: the registration spheres.
-        registration: of all of them.
+        registration: the registration of all images.
     """
     gaps = _gaps(registration)
     typical_px = float(np.median(list(gaps.values()))) if gaps else 0.0
@@ -72,7 +72,7 @@ def odd_images(
 
 
 def too_many(odd: Collection[int], images: PosedImages) -> Contradiction | None:
-    """The finding that so many images contradict one another that none can be left out; None if they are few."""
+    """Report that so many images contradict one another that none can be left out; None if they are few."""
     n = len(images.poses)
     if len(odd) <= MOST_LEFT_OUT * n:
         return None
@@ -89,13 +89,13 @@ def describe_left_out(
     spheres: ScanSpheres,
     registration: RegistrationResult,
 ) -> dict[int, Contradiction]:
-    """What is wrong with each image that was left out of a registration, by its index."""
+    """Describe what is wrong with each image that was left out of a registration, by its index."""
     own = {i: _own_pose(outlines[i], images, spheres) for i in sorted(left_out)}
     return {i: _finding(i, own, outlines, images, registration) for i in own}
 
 
 def _gaps(registration: RegistrationResult) -> dict[int, float]:
-    """Median distance (px) of each image's outlines from those predicted with its pose as given."""
+    """Return the median distance (px) of each image's outlines from those predicted with its pose as given."""
     by_image: dict[int, list[float]] = {}
     for r in registration.residuals:
         by_image.setdefault(r.image, []).append(r.rms_px)
@@ -103,7 +103,7 @@ def _gaps(registration: RegistrationResult) -> dict[int, float]:
 
 
 def _misses_most(i: int, images: PosedImages, spheres: ScanSpheres, registration: RegistrationResult) -> bool:
-    """Whether an image shows hardly one of the spheres where its pose says they are."""
+    """Return whether an image shows hardly one of the spheres where its pose says they are."""
     T = registration.T_scan_camera[i]
     if not np.isfinite(T).all():
         return False
@@ -113,7 +113,7 @@ def _misses_most(i: int, images: PosedImages, spheres: ScanSpheres, registration
 
 
 def _own_pose(found: Sequence[SphereOutline], images: PosedImages, spheres: ScanSpheres) -> Transform | None:
-    """T_scan_camera by an image's own spheres; None if they do not tell."""
+    """Return T_scan_camera by an image's own spheres; None if they do not determine it."""
     readings = image_hypotheses(found, spheres.centres_m, spheres.radius_m, images.camera)
     if not readings or rivals(readings):
         return None
@@ -156,7 +156,7 @@ def _finding(
 
 
 def _with_pose(mine: Transform, given: Array, i: int) -> int | None:
-    """The other image whose given pose this is."""
+    """Return the other image whose given pose this is."""
     for k, T in enumerate(given):
         if k == i or not np.isfinite(T).all():
             continue
@@ -179,7 +179,7 @@ def odd_spheres(
     registration: RegistrationResult,
     search: SearchNearby | None,
 ) -> tuple[Contradiction, ...]:
-    """Spheres of the list that hardly any image shows where it is, and where they are, if the images tell.
+    """Find spheres of the list that hardly any image shows where it is, and where they are, if the images show that.
 
     Raises:
         ComputeError: most are not found, and the mirrored list explains the images better.

@@ -14,7 +14,7 @@ Cost = Literal["cone", "sampson", "algebraic"]
 
 
 def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost) -> Array:
-    """Signed residuals (N,) of normalised points (N, 3), z = 1, against spheres at (N, 3) in the camera frame.
+    """Return signed residuals (N,) of normalised points (N, 3), z = 1, against spheres at (N, 3) in the camera frame.
 
     The outline of a sphere is x^T E x = 0 with E^-1 = P Q^-1 P^T. In the camera frame P = [I | 0] and
     Q^-1 ~ [[r^2 I - c c^T, -c], [-c^T, -1]], hence E ~ (|c|^2 - r^2) I - c c^T.
@@ -28,7 +28,7 @@ def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: Poi
 def residuals_and_derivative(
     points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost
 ) -> tuple[Array, Array]:
-    """Residuals (N,) as from `residuals`, and their derivative (N, 3) by the centres."""
+    """Return the residuals (N,) as from `residuals`, and their derivative (N, 3) by the centres."""
     return _value_and_gradient(points, centres_camera_m, radius_m, cost, derivative=True)
 
 
@@ -72,7 +72,7 @@ class CommonErrors:
     and on the dark limb. No view separates it from a displacement of the scan, so this part of the predicted error
     remains however many images are taken. `own_light_px`: displacement, per coordinate, of each sphere by light that
     is its own, from the specimen and the table beside it, alike in all images: it counts as an error of the sphere's
-    centre in what is stated, but is not estimated, since it would take up other errors.
+    centre in what is given, but is not estimated, since it would take up other errors.
     """
 
     shift_px: float
@@ -94,17 +94,17 @@ EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0
 
 @dataclass(frozen=True, slots=True)
 class RegistrationSettings:
-    """What is estimated, by which residual, and the uncertainty of what is given.
+    """The unknowns of a registration, its residual, and the uncertainty of what is given.
 
     Attributes:
         cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
             `algebraic` is the paper's plain x^T E x.
-        robust: whether to weight outlines robustly and exclude outliers.
-        pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
-            the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
-            "exact": no pose errors; "free": the outlines alone tell where each camera was.
-        intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
-            errors do not depend on the intrinsics'. None leaves them to the error budget.
+        robust: true to weight outlines robustly and exclude outliers.
+        pose_covariance: (N, 6, 6) covariance of each pose's (position in the unit of the poses, rotation vector in
+            radians) in the axes of its base, independent between images; "estimate": isotropic, estimated from the
+            residuals; "exact": no pose errors; "free": the outlines alone determine where each camera was.
+        intrinsics_covariance: (4, 4) covariance of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for
+            poses whose errors do not depend on the intrinsics'. None leaves them to the error budget.
         common_errors: prior sizes of errors shared by all outlines of a capture.
     """
 

@@ -32,11 +32,12 @@ class RigidMean:
 
     Attributes:
         T: (4, 4) T_a_b.
-        covariance: (6, 6) of (d, w) of `T`: exp([w]x) R, t + d, m and rad. It follows the scatter of the poses where
-            that is larger than their stated covariances.
-        chi2_reduced: of the poses that were kept, against their stated covariances; 1 for a single pose.
-        kept: (N,) poses that agree with the mean.
-        deviations: (N, 6) of (d, w) of every pose from the mean, m and rad.
+        covariance: (6, 6) covariance of (d, w) of `T`: exp([w]x) R, t + d, m and rad. It follows the scatter of the
+            poses where that is larger than their given covariances.
+        chi2_reduced: reduced chi square of the poses in the mean against their given covariances; 1 for a single
+            pose.
+        kept: (N,) true for poses that agree with the mean.
+        deviations: (N, 6) deviation (d, w) of every pose from the mean, m and rad.
     """
 
     T: Transform
@@ -47,26 +48,26 @@ class RigidMean:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square distance of the kept poses from the mean."""
+        """Root mean square distance of the poses in the mean from the mean."""
         return _rms(self.deviations[self.kept, :3])
 
     @property
     def rms_rad(self) -> float:
-        """Root mean square angle of the kept poses from the mean."""
+        """Root mean square angle of the poses in the mean from the mean."""
         return _rms(self.deviations[self.kept, 3:])
 
 
 def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
-    """The pose T on which most of N independent measurements of it agree, weighted by their covariances.
+    """Return the pose T on which most of N independent measurements of it agree, weighted by their covariances.
 
     It minimises the sum of squared Mahalanobis distances of the poses that agree; the others are excluded. A distance
-    is judged against the stated covariances times a common factor, the median distance over its expectation, if that
-    is above 1: so the poses may scatter more than stated, as long as few stand out. If all contradict one another,
+    is judged against the given covariances times a common factor, the median distance over its expectation, if that
+    is above 1: so the poses may scatter more than given, as long as few stand out. If all contradict one another,
     none is excluded, and `covariance`, `chi2_reduced` and `rms_m` show it.
 
     Args:
         poses: (N, 4, 4) measurements of T.
-        covariances: (N, 6, 6) of (d, w) of each, positive definite.
+        covariances: (N, 6, 6) covariance of (d, w) of each, positive definite.
 
     Raises:
         DataError: the shapes do not agree, or there is no pose.
@@ -96,7 +97,7 @@ def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
 
 
 def _middle(poses: Array, weights: Array) -> int:
-    """The pose from which the median distance to all poses is least."""
+    """Return the pose from which the median distance to all poses is least."""
     return int(np.argmin([np.median(_chi2(_deviations(poses, T), weights)) for T in poses]))
 
 
@@ -114,7 +115,7 @@ def _mean(poses: Array, weights: Array, start: Transform) -> Transform:
 
 
 def _deviations(poses: Array, T: Transform) -> Array:
-    """(N, 6) (d, w) with which T becomes each pose."""
+    """Return (N, 6) (d, w) with which T becomes each pose."""
     turned = Rotation.from_matrix(poses[:, :3, :3] @ T[:3, :3].T).as_rotvec()
     return np.hstack([poses[:, :3, 3] - T[:3, 3], turned])
 
@@ -136,11 +137,11 @@ class SightedPose:
     """The pose of a camera from the spheres in one of its images.
 
     Attributes:
-        T_scan_camera: (4, 4).
+        T_scan_camera: (4, 4) the camera's pose in the scan frame.
         noise: (6, 6) covariance due to the noise of the outlines, which differs between images.
         common: (6, 6) covariance due to errors of spheres, lens and edges, which many images share.
-        spheres: number of them.
-        rms_px: of their outlines.
+        spheres: number of spheres.
+        rms_px: root mean square residual of their outlines.
     """
 
     T_scan_camera: Transform = field(repr=False)
@@ -155,9 +156,9 @@ class FurtherPose:
     """A further camera in its outer frame: that of the scan, or of the first camera.
 
     Attributes:
-        mean: of the views' poses; its covariance is that of their noise alone.
-        covariance: (6, 6) of the mean, with what is common to the views.
-        names: of the views, in the order of the mean's.
+        mean: mean of the views' poses; its covariance is that of their noise alone.
+        covariance: (6, 6) covariance of the mean, with what is common to the views.
+        names: names of the views, in the order of the mean's.
     """
 
     mean: RigidMean
@@ -170,8 +171,8 @@ class OuterFrame:
     """The first camera while a further one exposed.
 
     Attributes:
-        T_scan_first: (4, 4) its pose.
-        covariance: (6, 6) of that, the part that is common to all views.
+        T_scan_first: (4, 4) its pose in the scan frame.
+        covariance: (6, 6) the part of its pose's covariance that is common to all views.
     """
 
     T_scan_first: Transform = field(repr=False)
@@ -181,16 +182,16 @@ class OuterFrame:
 def sighted_pose(
     outlines: Sequence[SphereOutline], camera: CameraModel, spheres: ScanSpheres, lens: Array | None
 ) -> SightedPose:
-    """The pose of a camera from the outlines in one image, which tell which sphere is which.
+    """Compute the pose of a camera from the outlines in one image, which show which sphere is which.
 
     Args:
-        outlines: of the image.
+        outlines: the image's outlines.
         camera: its intrinsics.
-        spheres: in the frame of the scan.
+        spheres: the spheres in the frame of the scan.
         lens: (8, 8) covariance of fx, fy, cx, cy, k1, k2, p1, p2; None: exact.
 
     Raises:
-        ComputeError: too few spheres, or more than one way to tell them apart.
+        ComputeError: too few spheres, or more than one way to identify them.
     """
     (read,) = identify_each([outlines], camera, spheres)
     if read.T_camera_scan is None:
@@ -210,7 +211,7 @@ def sighted_pose(
 
 
 def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
-    """T_scan_camera of a camera that stood still.
+    """Return T_scan_camera of a camera that stood still.
 
     It saw each sphere at the same pixels in every image. What the outlines err there is the same in each, so many
     images are no more certain than one; they show whether the camera was moved.
@@ -221,9 +222,9 @@ def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
 
 
 def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]) -> FurtherPose:
-    """T_first_camera of a camera beside the first one, from the views at which the first one's pose is known.
+    """Return T_first_camera of a camera beside the first one, from the views at which the first one's pose is known.
 
-    What both cameras' poses have in common by the spheres is counted twice, which states more than there is.
+    What both cameras' poses have in common by the spheres is counted twice, which overstates it.
 
     Raises ComputeError: there is no such view.
     """

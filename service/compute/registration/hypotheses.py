@@ -43,7 +43,7 @@ class Sightings:
 
 
 def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
-    """The geometry of one image's outlines."""
+    """Return the geometry of one image's outlines."""
     cones = ObservedCones.of(o.cone for o in outlines)
     distance = radius_m / np.sin(cones.half_angles)
     # Half a pixel of the radius covers an outline's systematic error; more if only a part is visible.
@@ -85,7 +85,7 @@ def paired(
     camera: CameraModel,
     gate: MatchGate = ROBOT_GATE,
 ) -> dict[int, int]:
-    """Outline → sphere (M, 3) of the scan frame, matched by predicted directions and sizes."""
+    """Return the outline → sphere (M, 3) of the scan frame, matched by predicted directions and sizes."""
     pairs = match(sightings(outlines, radius_m, camera), apply(T_camera_scan, spheres_m), radius_m, gate)
     return {d: m for d, m, _ in pairs}
 
@@ -97,7 +97,7 @@ _CHUNK = 4000  # triples refined at a time
 _TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
 _OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
 _EVIDENCE = 14.0  # log likelihood ratio of a marker to a false detection at an expected place; a low estimate
-_MOST_KEPT = 512  # images whose hypotheses are kept
+_MOST_KEPT = 512  # images whose hypotheses are cached
 _MARGIN = 9.0  # log odds at which an assignment counts as unique
 
 
@@ -119,14 +119,14 @@ class Hypothesis:
 def image_hypotheses(
     outlines: Sequence[SphereOutline], centres_scan_m: Array, radius_m: float, camera: CameraModel
 ) -> list[Hypothesis]:
-    """Distinct assignments that explain at least four detections of an image, the best first.
+    """Find distinct assignments that explain at least four detections of an image, the best first.
 
     Triples of detections are paired with all ordered triples of markers whose mutual distances fit (the known radius
     and the apparent size give depth to about one per cent). Each pair gives a pose from the nine parameters of its
     three outlines. Poses that fit must predict a fourth detection, and all further ones. The survivors are solved
     from all their outlines and judged by their residuals in standard deviations.
 
-    The answer does not depend on camera poses, so it is kept for the registrations of the same images with others.
+    The answer does not depend on camera poses, so it is cached for the registrations of the same images with others.
     """
     if len(outlines) < 4 or len(centres_scan_m) < 4:
         return []
@@ -135,7 +135,7 @@ def image_hypotheses(
 
 
 class _Question:
-    """What the hypotheses of an image follow from; equal if all its numbers are."""
+    """The inputs that determine the hypotheses of an image; equal if all its numbers are."""
 
     def __init__(self, seen: Sightings, centres: Array, radius_m: float, focal_px: float) -> None:
         self.seen, self.centres, self.radius_m, self.focal_px = seen, centres, radius_m, focal_px
@@ -181,7 +181,7 @@ def _answered(question: _Question) -> tuple[Hypothesis, ...]:
 
 
 def rivals(readings: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """From assignments sorted best first, select the best and those that contradict it and are nearly as likely."""
+    """Select, from assignments sorted best first, those that contradict the best and are nearly as likely."""
     if not readings:
         return []
     best = readings[0]
@@ -214,7 +214,7 @@ def _triples(seen: Sightings, D: int, centres: Array) -> tuple[NDArray[np.int64]
 
 
 def _kabsch(model: Array, image: Array) -> tuple[Array, Array]:
-    """Rotations (K, 3, 3) and translations (K, 3) with image = R model + t, for batches (K, 3, 3) of three points."""
+    """Return rotations (K, 3, 3) and translations (K, 3) with image = R model + t, for three points each."""
     cm, ci = model.mean(axis=1), image.mean(axis=1)
     H = np.einsum("kni,knj->kij", image - ci[:, None], model - cm[:, None])
     U, _, Vt = np.linalg.svd(H)
@@ -230,7 +230,7 @@ _LOOSE = MatchGate(0.4, 0.06)  # of a triple's pose
 def _fitting(
     seen: Sightings, model: NDArray[np.int64], image: NDArray[np.int64], centres: Array, radius_m: float
 ) -> tuple[Array, Array]:
-    """Poses (K, 3, 3), (K, 3) of the triples whose nine parameters fit one pose."""
+    """Return poses (K, 3, 3), (K, 3) of the triples whose nine parameters fit one pose."""
     rotations: list[Array] = []
     places: list[Array] = []
     for start in range(0, len(model), _CHUNK):
@@ -246,7 +246,7 @@ def _fitting(
 def _pose_steps(
     seen: Sightings, pick: NDArray[np.int64], points: Array, rotation: Array, t: Array, radius_m: float, steps: int
 ) -> tuple[Array, Array, Array]:
-    """A number of Gauss–Newton steps for K poses at a time: rotations, translations and chi² (K,).
+    """Return a number of Gauss–Newton steps for K poses at a time: rotations, translations and chi² (K,).
 
     Each pose explains the cones of detections `pick` (K, k) by spheres at `points` (K, k, 3).
     """
@@ -287,7 +287,7 @@ class _Poses:
 
 
 def _damped_steps(J: Array, r: Array) -> Array:
-    """Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N), with limited rotations."""
+    """Return Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N), with limited rotations."""
     JJ = J.transpose(0, 2, 1) @ J
     H = JJ + 1e-9 * np.trace(JJ, axis1=1, axis2=2)[:, None, None] * np.eye(6)
     dx = -np.linalg.solve(H, np.einsum("kni,kn->ki", J, r)[:, :, None])[:, :, 0]
@@ -296,7 +296,7 @@ def _damped_steps(J: Array, r: Array) -> Array:
 
 
 def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: float) -> tuple[NDArray[np.int64], Array]:
-    """Number of detections (K,) that each pose explains within loose gates, and their mean angle in radii."""
+    """Count the detections (K,) that each pose explains within loose gates; return their mean angle in radii too."""
     counts = np.zeros(len(R), dtype=np.int64)
     error = np.zeros(len(R))
     for start in range(0, len(R), 2000):
@@ -324,7 +324,7 @@ def _refine(
     radius_m: float,
     focal_px: float,
 ) -> Hypothesis | None:
-    """The assignment solved from all its outlines, without those that do not fit and with further ones that do."""
+    """Solve an assignment from all its outlines, without those that do not fit and with further ones that do."""
     for _ in range(6):
         pick, chosen = np.array(list(markers)), np.array(list(markers.values()))
         new_R, new_t, _ = _pose_steps(seen, pick[None], centres[chosen][None], rotation[None], t[None], radius_m, 5)

@@ -73,8 +73,8 @@ def identify(
     """Assign the registration spheres to outlines, station by station, so that all poses of a station agree.
 
     Args:
-        outlines: per image; those of other spheres stay unassigned.
-        images: with their poses. If these are not metric, their scale is estimated too.
+        outlines: the outlines of each image; those of other spheres stay unassigned.
+        images: the images with their poses. If these are not metric, their scale is estimated too.
         spheres: the registration spheres.
 
     Raises:
@@ -163,12 +163,12 @@ def _require_any(
 
 
 def _named(markers: dict[int, int]) -> str:
-    """An assignment in words: outline = sphere, counted from 0."""
+    """Describe an assignment: outline = sphere, counted from 0."""
     return "{" + ", ".join(f"{d}={m}" for d, m in sorted(markers.items())) + "}"
 
 
 def _solve_station(station: _Station) -> _Reading:
-    """The assignment on which the images of a station agree."""
+    """Return the assignment on which the images of a station agree."""
     readings, n_images = station.readings, len(station.poses)
     if not any(readings):
         raise ComputeError(
@@ -197,7 +197,7 @@ def _solve_station(station: _Station) -> _Reading:
 
 
 def _in_another_scale(station: _Station, error: ComputeError) -> ComputeError:
-    """The error, or what is wrong with the scale if the poses fit the spheres in another one."""
+    """Return the error, or what is wrong with the scale if the poses fit the spheres in another one."""
     if not station.metric:
         return error
     solved = _solutions(replace(station, metric=False))
@@ -217,7 +217,7 @@ def _in_another_scale(station: _Station, error: ComputeError) -> ComputeError:
 
 
 def _solutions(station: _Station) -> list[_Reading]:
-    """Every distinct solution to which the single images lead, the best first."""
+    """Return every distinct solution to which the single images lead, the best first."""
     solved: list[_Reading] = []
     tried: set[frozenset[tuple[int, int, int]]] = set()
     starts = _metric_starts if station.metric else _similarity_starts
@@ -260,7 +260,7 @@ def _scale_unknown(station: _Station) -> ComputeError:
 
 
 def _agreeing(best: _Reading, readings: Sequence[list[Hypothesis]]) -> int:
-    """Number of images whose own hypotheses include the assignment."""
+    """Return the number of images whose own hypotheses include the assignment."""
     return sum(
         any(len(set(h.markers.items()) & set(m.items())) >= min(4, h.count) for h in r)
         for m, r in zip(best.markers, readings, strict=True)
@@ -275,7 +275,7 @@ def _differ(a: _Reading, b: _Reading) -> bool:
 
 
 def _first_difference(a: _Reading, b: _Reading) -> tuple[dict[int, int], dict[int, int]]:
-    """The markers of the first image in which two solutions differ."""
+    """Return the markers of the first image in which two solutions differ."""
     return next(
         (x, y) for x, y in zip(a.markers, b.markers, strict=True) if any(d in y and y[d] != m for d, m in x.items())
     )
@@ -290,7 +290,7 @@ def _metric_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[t
 
 
 def _similarity_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
-    """Initial similarities from pairs of images: their rotations must agree, their distance gives the scale."""
+    """Compute similarities to start from pairs of images: rotations must agree, their distance gives the scale."""
     ranked = sorted(
         ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
         reverse=True,
@@ -326,7 +326,7 @@ def _camera_centres(T_world_scan: Transform, s: float, pose: Transform, centres:
 
 
 def _read(T_world_scan: Transform, s: float, station: _Station) -> _Reading:
-    """The outlines that lie where a solution predicts spheres."""
+    """Return the outlines that lie where a solution predicts spheres."""
     markers: list[dict[int, int]] = []
     cost, total = 0.0, 0
     for sight, pose in zip(station.seen, station.poses, strict=True):
@@ -339,7 +339,7 @@ def _read(T_world_scan: Transform, s: float, station: _Station) -> _Reading:
 
 
 def _polish(reading: _Reading, station: _Station) -> _Reading:
-    """Least squares on the directions of all matched spheres, alternating with matching until nothing changes.
+    """Solve least squares on the directions of all matched spheres, alternating with matching until nothing changes.
 
     The residuals are those of `ObservedCones` in radii. They are written out here to keep their rounding: the noise
     estimated from nearly exact outlines depends on the last digits, and a replay must reproduce recorded results.
@@ -400,9 +400,9 @@ def _words_of_other_scale(
     radius_m: float,
     camera: CameraModel,
 ) -> str:
-    """In which other scale an image shows the list, in words; an empty text if in none.
+    """Describe the other scale in which an image shows the list; an empty text if there is none.
 
-    An image alone cannot tell a list in another scale from another radius of the spheres.
+    An image alone cannot distinguish a list in another scale from another radius of the spheres.
     """
     best: tuple[int, float, int] = (0, 1.0, 0)
     factors = (
@@ -429,7 +429,7 @@ def _words_of_other_scale(
 
 
 def words_of_unit(scale: float) -> str:
-    """The mistake by which lengths have to be multiplied by `scale`, in words within brackets, or nothing."""
+    """Return the mistake by which lengths have to be multiplied by `scale`, as text within brackets, or nothing."""
     others = (words for words, factor in _OTHER_MISTAKES.items() if abs(scale / factor - 1) < _NEAR)
     words = mistaken_length(scale, _NEAR) or next(others, "")
     return f" ({words})" if words else ""

@@ -1,4 +1,4 @@
-"""Propagates errors of camera poses: correlated ones into a registration, and those that a registration states."""
+"""Propagates errors of camera poses: correlated ones into a registration, and those that a registration reports."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from service.core.geometry import Array, Transform, skew
 
 
 def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
-    """(6 N, 6 N) joint covariance of `T_scan_camera`, or of `T_scan_camera_refined`.
+    """Compute the (6 N, 6 N) joint covariance of `T_scan_camera`, or of `T_scan_camera_refined`.
 
-    Of (d, w) of each pose: exp([w]x) R, t + d, in the axes of the scan, m and rad. It is whole: the registration's
-    share is in it. Rows of images at stations without outlines are NaN.
+    It is that of (d, w) of each pose: exp([w]x) R, t + d, in the axes of the scan, m and rad. It is whole: the
+    registration's share is in it. Rows of images at stations without outlines are NaN.
 
     With B = T_base_scan of an image's station, R its rotation and a the vector from its origin to the camera,
     d_scan = R^T (d - d_B + a x w_B) and w_scan = R^T (w - w_B), where xi = (d, w) is the error of the pose in its
-    base. The outlines tell of it that xi = xi_0 + K x + own error, with x the error of the common unknowns, whose
+    base. The outlines show that xi = xi_0 + K x + own error, with x the error of the common unknowns, whose
     covariance is C, and own errors of covariance Q. Refined poses have xi_0 taken off. Given ones do not: the
     covariance of their xi is P, and that of xi with x is K C.
 
@@ -63,7 +63,7 @@ def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
 
 
 def _with_calibrated_lens(s: Solution) -> tuple[Array, Array]:
-    """(n, n) covariances of the common unknowns: with the lens as calibrated, and what its errors then cause.
+    """Return (n, n) covariances of the common unknowns: with the lens as calibrated, and what its errors then cause.
 
     An error e of the lens is one of V e of the unknowns, V the regression of their errors on those of the lens.
     """
@@ -84,9 +84,9 @@ def with_joint_pose_covariance(registration: RegistrationResult, covariance: Arr
     ones by their positions: a scale error that moves the scan with all cameras does not count.
 
     Args:
-        registration: of all images in `covariance`, in the same order.
-        covariance: (6 N, 6 N) of the poses given to `register` (positions in their unit, rotation vectors), from
-            `similarity_covariance`.
+        registration: the registration of all images in `covariance`, in the same order.
+        covariance: (6 N, 6 N) covariance of the poses given to `register` (positions in their unit, rotation
+            vectors), from `similarity_covariance`.
 
     Raises:
         DataError: the covariance is for another number of images.
@@ -116,7 +116,7 @@ def with_joint_pose_covariance(registration: RegistrationResult, covariance: Arr
 
 
 def of_inverse(T_a_b: Transform, covariance: Array) -> Array:
-    """Covariance of T_b_a (6, 6) from that of T_a_b: with R and t of T_a_b, d' = -R^T (d + t x w), w' = -R^T w."""
+    """Return the covariance of T_b_a (6, 6) from that of T_a_b with R, t: d' = -R^T (d + t x w), w' = -R^T w."""
     R, t = T_a_b[:3, :3], T_a_b[:3, 3]
     J = np.zeros((6, 6))
     J[:3, :3], J[3:, 3:] = -R.T, -R.T
@@ -125,13 +125,13 @@ def of_inverse(T_a_b: Transform, covariance: Array) -> Array:
 
 
 def of_product(T_a_b: Transform, T_b_c: Transform, covariance_a_b: Array, covariance_b_c: Array) -> Array:
-    """Covariance of T_a_c (6, 6) from those of its two independent factors."""
+    """Return the covariance of T_a_c (6, 6) from those of its two independent factors."""
     by_a_b, by_b_c = product_jacobians(T_a_b, T_b_c)
     return by_a_b @ covariance_a_b @ by_a_b.T + by_b_c @ covariance_b_c @ by_b_c.T
 
 
 def product_jacobians(T_a_b: Transform, T_b_c: Transform) -> tuple[Array, Array]:
-    """Derivatives (6, 6) of T_a_c by T_a_b and by T_b_c."""
+    """Return the derivatives (6, 6) of T_a_c by T_a_b and by T_b_c."""
     R = T_a_b[:3, :3]
     moved, turned = np.eye(6), np.zeros((6, 6))
     moved[:3, 3:] = -skew(R @ T_b_c[:3, 3])

@@ -79,7 +79,7 @@ class Problem:
         return self.common_column + 3 + self.common.shape[2]
 
     def prior(self) -> Array:
-        """(n, n) prior information on the common unknowns."""
+        """Return (n, n) prior information on the common unknowns."""
         out = np.zeros((self.size, self.size))
         if self.sphere_prior is not None:
             out[self.sphere_column : self.common_column, self.sphere_column : self.common_column] = self.sphere_prior
@@ -98,7 +98,7 @@ class State:
     poses: Array  # (N, 6) errors of the poses: position (m), rotation vector, base axes
 
     def moved(self, problem: Problem, dx: Array, poses: Array) -> State:
-        """The state after a step of the common unknowns, with the pose errors that belong to it."""
+        """Return the state after a step of the common unknowns, with the pose errors that belong to it."""
         bases = self.bases.copy()
         for k in range(len(bases)):
             d = dx[6 * k : 6 * k + 6]
@@ -111,7 +111,7 @@ class State:
         return State(bases, scale, spheres, self.common + dx[problem.common_column :], poses)
 
     def prior_values(self, problem: Problem) -> Array:
-        """(n,) current values of the unknowns with a prior, zero for the others."""
+        """Return (n,) current values of the unknowns with a prior, zero for the others."""
         out = np.zeros(problem.size)
         if problem.sphere_prior is not None:
             out[problem.sphere_column : problem.common_column] = self.spheres.ravel()
@@ -119,7 +119,7 @@ class State:
         return out
 
     def cameras(self, problem: Problem, *, refined: bool) -> Array:
-        """(N, 4, 4) T_base_camera, metric; `refined`: corrected by the estimated pose errors."""
+        """Return (N, 4, 4) T_base_camera, metric; `refined`: corrected by the estimated pose errors."""
         T = problem.T_base_camera.copy()
         T[:, :3, 3] *= self.scale
         if refined:
@@ -191,7 +191,7 @@ def assemble(
 
 
 def _common_prior(settings: RegistrationSettings) -> Array:
-    """Information (6 + k, 6 + k) of the errors that all outlines share: light, shift and growth, then intrinsics."""
+    """Return information (6 + k, 6 + k) on errors that all outlines share: light, shift and growth, intrinsics."""
     e = settings.common_errors
     sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
     common = np.diag(1 / sigma**2)
@@ -203,7 +203,7 @@ def _common_prior(settings: RegistrationSettings) -> Array:
 def with_outlines(
     problem: Problem, outlines: Sequence[Sequence[SphereOutline]], members: list[tuple[int, int, int]]
 ) -> Problem:
-    """The problem with these outlines (image, outline, marker) instead of its own."""
+    """Return the problem with these outlines (image, outline, marker) instead of its own."""
     used = [outlines[i][j] for i, j, _ in members]
     camera, image = problem.camera, np.array([i for i, _, _ in members], dtype=np.int64)
     cones = ObservedCones.of(o.cone for o in used)
@@ -246,7 +246,7 @@ def _block_inverse(covariances: Array) -> Array:
 
 
 def _common_displacements(cones: ObservedCones, camera: CameraModel) -> Array:
-    """Displacement (O, 3, 3) of cones if all outlines shift by a pixel in x, in y, or grow by one."""
+    """Return the displacement (O, 3, 3) of cones if all outlines shift by a pixel in x, in y, or grow by one."""
     z = cones.axes[:, 2]
     out = np.zeros((len(cones), 3, 3))
     for k, f in enumerate((camera.fx, camera.fy)):
@@ -256,7 +256,7 @@ def _common_displacements(cones: ObservedCones, camera: CameraModel) -> Array:
 
 
 def _intrinsics_errors(cones: ObservedCones, camera: CameraModel) -> Array:
-    """Displacement (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, with the image pixels fixed."""
+    """Return displacements (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, at fixed image pixels."""
     z = cones.axes[:, 2]
     x, y = cones.axes[:, 0] / z, cones.axes[:, 1] / z
     r2, zero = x**2 + y**2, np.zeros(len(cones))
@@ -276,7 +276,7 @@ def _intrinsics_errors(cones: ObservedCones, camera: CameraModel) -> Array:
 
 
 def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
-    """Whitened rows of the outlines at a state, for any of the costs."""
+    """Return the whitened rows of the outlines at a state, for any of the costs."""
     T = state.cameras(problem, refined=True)[problem.image]
     origin = (problem.T_base_camera[problem.image, :3, 3]) * state.scale
     centres = problem.centres + state.spheres + problem.light_unit_m * state.common[:3]
@@ -313,7 +313,7 @@ def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
 
 
 def _point_rows(problem: Problem, centres: Array, cost: PointCost) -> tuple[Array, Array]:
-    """Three rows per outline with the normal equations of its points: derivative (O, 3, 3) and residual (O, 3)."""
+    """Return three rows per outline with its points' normal equations: derivative (O, 3, 3) and residual (O, 3)."""
     n = len(centres)
     N, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for start in range(0, n, _CHUNK):
@@ -360,7 +360,7 @@ class Blocks:
 
 
 def compress(J: Array, A: Array, r: Array, image: NDArray[np.int64], n_images: int, weights: Array) -> Blocks:
-    """Blocks from outlines' J (O, 3, n), A (O, 3, 6) and r (O, 3), each in `image` (O,) and with a weight (O,)."""
+    """Build blocks from outlines' J (O, 3, n), A (O, 3, 6) and r (O, 3), each of an `image` (O,) and a weight."""
     n = J.shape[2]
     root = np.sqrt(weights)[:, None, None]
     F = np.concatenate([J, A, r[:, :, None]], axis=2) * root
@@ -405,12 +405,12 @@ def marginalise(blocks: Blocks, root: Array, factor: float) -> Marginal:
 
 
 def pose_errors(blocks: Blocks, marginal: Marginal, dx: Array, factor: float) -> Array:
-    """Most probable pose errors (N, 6) for a step dx of the common unknowns."""
+    """Return the most probable pose errors (N, 6) for a step dx of the common unknowns."""
     return -np.einsum("nij,nj->ni", marginal.Q, blocks.Ar + np.einsum("nki,k->ni", blocks.JA, dx)) / factor
 
 
 def outline_and_pose_shares(blocks: Blocks, marginal: Marginal, root: Array, factor: float) -> tuple[Array, Array]:
-    """Parts (n, n) of H due to the noise of the outlines and to that of the poses; they sum to H.
+    """Return the parts (n, n) of H due to the noise of the outlines and to that of the poses; they sum to H.
 
     With R = C + A P A' they are J' R^-1 C R^-1 J and J' R^-1 A P A' R^-1 J.
     """
@@ -423,13 +423,13 @@ def outline_and_pose_shares(blocks: Blocks, marginal: Marginal, root: Array, fac
 
 
 def solve_symmetric(H: Array, b: Array) -> Array:
-    """H^-1 b for a positive semi-definite H, scaled first because the unknowns' units differ."""
+    """Return H^-1 b for a positive semi-definite H, scaled first because the unknowns' units differ."""
     d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     scaled = H * np.outer(d, d)
     return d * np.linalg.lstsq(scaled, d * b, rcond=1e-14)[0]
 
 
 def inverse_symmetric(H: Array) -> Array:
-    """H^-1 (pseudo-inverse), scaled first because the unknowns' units differ."""
+    """Return H^-1 (pseudo-inverse), scaled first because the unknowns' units differ."""
     d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     return np.linalg.pinv(H * np.outer(d, d), rcond=1e-14, hermitian=True) * np.outer(d, d)

@@ -48,7 +48,7 @@ class Solution:
     outline_factor: float
 
     def by_own_light(self) -> Array:
-        """(n, n) what light of their own on single spheres adds to the covariance of the common unknowns.
+        """Return (n, n) what light of their own on single spheres adds to the covariance of the common unknowns.
 
         The adjustment knows nothing of it: with C the covariance and P the information on the spheres' centres, a
         displacement e of the centres moves the unknowns by C P e.
@@ -60,7 +60,7 @@ class Solution:
         return np.asarray(p.own_light_m**2 * moved @ moved.T, dtype=np.float64)
 
     def pose_gain(self) -> Array:
-        """(N, 6, n) K with xi = K dx + own error of covariance Q: how pose errors follow the common unknowns."""
+        """Return (N, 6, n) K with xi = K dx + own error of covariance Q: pose errors follow the common unknowns."""
         return -(self.marginal.Q @ self.blocks.JA.transpose(0, 2, 1)) / self.outline_factor
 
 
@@ -85,14 +85,14 @@ class RegistrationResult:
     residuals: tuple[OutlineResidual, ...]
     T_scan_camera: Array = field(repr=False)  # (N, 4, 4) metric, each image through its own group, poses as given
     chi2_reduced: (
-        float  # of the outlines with their stated covariances, per degree of freedom; near 1 if those are right
+        float  # of the outlines with their given covariances, per degree of freedom; near 1 if those are right
     )
     n_images: int
     cost: str
     components: dict[str, Array] = field(repr=False)
     T_scan_camera_refined: Array = field(repr=False)  # (N, 4, 4) corrected by the estimated pose errors
     pose_sigma: tuple[float, float]  # m and rad, rms per coordinate, of single poses' errors; 0 if taken as exact
-    outline_factor: float  # factor on the outlines' stated variances, estimated from the residuals
+    outline_factor: float  # factor on the outlines' given variances, estimated from the residuals
     solution: Solution = field(repr=False)
 
     @property
@@ -110,7 +110,7 @@ class RegistrationResult:
         return np.sum(list(self.refined_components().values()), axis=0)
 
     def refined_components(self) -> dict[str, Array]:
-        """Parts of `refined_covariance`; the noise of outlines and poses is inseparable and one part."""
+        """Return the parts of `refined_covariance`; the noise of outlines and poses is inseparable and one part."""
         s = self.solution
         problem = s.problem
         by_common, own = self.refined_gain()
@@ -124,7 +124,7 @@ class RegistrationResult:
         return {"outlines and poses": noise, "common": common, "spheres": spheres}
 
     def refined_gain(self) -> tuple[Array, Array]:
-        """How errors move the scan relative to `T_scan_camera_refined`, averaged over all images with outlines.
+        """Return how errors move the scan relative to `T_scan_camera_refined`, averaged over images with outlines.
 
         Returns:
             (6, n) by errors of the n common unknowns, and the (6, 6) covariance by the images' own errors.
@@ -148,19 +148,19 @@ class RegistrationResult:
         return by_common, own
 
     def sigma_map_m(self, points_scan_m: Array) -> Array:
-        """Target registration error: predicted standard deviation (N,) in m, 3D, at points (N, 3) of the scan."""
+        """Predict the target registration error: 3D standard deviation (N,) in m at points (N, 3) of the scan."""
         return np.sqrt(_variance_m2(points_scan_m @ self.T_world_scan[:3, :3].T, self.covariance))
 
     def sigma_at_m(self, point_scan_m: Array) -> float:
-        """Target registration error: predicted standard deviation (3D) in metres at a point (3,) of the scan."""
+        """Predict the target registration error: 3D standard deviation in metres at a point (3,) of the scan."""
         return float(self.sigma_map_m(np.asarray(point_scan_m)[None])[0])
 
     def covariance_at_m2(self, point_scan_m: Array) -> Array:
-        """(3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
+        """Return (3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
         return self._at_m2(self.covariance, point_scan_m)
 
     def part_at_m2(self, component: str, point_scan_m: Array) -> Array:
-        """(3, 3) the part of `covariance_at_m2` that a component causes."""
+        """Return (3, 3) the part of `covariance_at_m2` that a component causes."""
         return self._at_m2(self.components[component], point_scan_m)
 
     def _at_m2(self, covariance: Array, point_scan_m: Array) -> Array:
@@ -169,7 +169,7 @@ class RegistrationResult:
 
 
 def _variance_m2(turned: Array, covariance: Array) -> Array:
-    """Trace (N,) of the position covariance of points `turned` (N, 3): rotated, relative to the scan's origin."""
+    """Return traces (N,) of the position covariance of points `turned` (N, 3): rotated, from the scan's origin."""
     # The expectation of |d + w x v|^2: tr D + 2 v . E[d x w] + |v|^2 tr W - v' W v
     D, X, W = covariance[:3, :3], covariance[:3, 3:6], covariance[3:6, 3:6]
     twist = np.array([X[1, 2] - X[2, 1], X[2, 0] - X[0, 2], X[0, 1] - X[1, 0]])
@@ -206,7 +206,7 @@ def held_out_rows(
     members: list[tuple[int, int, int]],
     centres_scan_m: Array,
 ) -> HeldOutRows:
-    """Rows of outlines of other spheres, (C, 3) in the scan frame; members are (image, outline, sphere)."""
+    """Return rows of outlines of other spheres, (C, 3) in the scan frame; members are (image, outline, sphere)."""
     own = solution.problem
     problem = replace(with_outlines(own, outlines, members), centres=np.asarray(centres_scan_m), sphere_prior=None)
     state = replace(solution.state, spheres=np.zeros_like(problem.centres))
@@ -223,13 +223,13 @@ def held_out_rows(
 def predict(
     solution: Solution, rows: HeldOutRows, *, refined: bool, centre_covariance_m2: Array | None = None
 ) -> list[Prediction]:
-    """Residuals of outlines, compared with their predicted covariance.
+    """Predict residuals of outlines, and compare them with their predicted covariance.
 
     Args:
-        solution: without these outlines.
-        rows: linearised at the solution.
-        refined: whether the prediction uses the pose corrected by its estimated error, or the pose as given.
-        centre_covariance_m2: (O, 3, 3) of each outline's sphere, scan frame.
+        solution: the solution without these outlines.
+        rows: the outlines' rows, linearised at the solution.
+        refined: true if the prediction uses the pose corrected by its estimated error, false for the pose as given.
+        centre_covariance_m2: (O, 3, 3) covariance of each outline's sphere, scan frame.
     """
     gain, Q = solution.pose_gain()[rows.image], solution.marginal.Q[rows.image]
     spread = solution.covariance

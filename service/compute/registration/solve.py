@@ -51,16 +51,16 @@ def register(
     """Estimate T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
 
     An outline contributes its three parameters, weighted by their covariance. Errors of the camera poses, which move
-    all spheres of an image together, are marginalised, with their size as stated or estimated from the residuals.
-    Errors of the spheres, of the intrinsics and those shared by all outlines are estimated, with their stated sizes
+    all spheres of an image together, are marginalised, with their size as given or estimated from the residuals.
+    Errors of the spheres, of the intrinsics and those shared by all outlines are estimated, with their given sizes
     as priors.
 
     Args:
-        outlines: per image, from the detector.
-        assignments: per image, outline index → marker index, and an initial pose (from `identify`).
-        images: with their poses; images of one station share a base frame.
+        outlines: the detector's outlines of each image.
+        assignments: outline index → marker index of each image, and an initial pose (from `identify`).
+        images: the images with their poses; images of one station share a base frame.
         spheres: the registration spheres.
-        settings: what is estimated, by which residual, and how well the inputs are known.
+        settings: the unknowns, the residual, and how well the inputs are known.
 
     Raises:
         ComputeError: the outlines do not determine the answer, or no convergence.
@@ -113,12 +113,12 @@ class _Iterate:
     """A state with its rows, its objective, and the Gauss–Newton step from it.
 
     Attributes:
-        state: of the common unknowns and the pose errors.
-        rows: of the outlines there.
+        state: state of the common unknowns and the pose errors.
+        rows: rows of the outlines there.
         objective: weighted sum of squares, with the priors.
         dx: (n,) step of the common unknowns.
         poses: (N, 6) pose errors after the whole step.
-        decrement: of the objective by the step, if the problem were linear.
+        decrement: decrease of the objective by the step, if the problem were linear.
     """
 
     state: State
@@ -130,7 +130,7 @@ class _Iterate:
 
 
 def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) -> _Iterate:
-    """Gauss–Newton; a step that would increase the objective is halved.
+    """Descend by Gauss–Newton; a step that would increase the objective is halved.
 
     Halving, not damping: the poses' errors are eliminated with their own covariance, and a shorter step shortens them
     in proportion.
@@ -168,7 +168,7 @@ def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) 
 
 
 def _gain(here: _Iterate, there: _Iterate) -> float:
-    """Decrease of the objective; growth by rounding alone does not count."""
+    """Return the decrease of the objective; growth by rounding alone does not count."""
     return here.objective * (1 + 1e-9) + 1e-9 - there.objective
 
 
@@ -211,7 +211,7 @@ def _begin(problem: Problem, start: State) -> _Iterate:
 
     def weighted(rows: Linearised) -> _Weighting:
         seen = np.linalg.norm(np.linalg.solve(problem.whiten, rows.r[:, :, None])[:, :2, 0], axis=1)
-        # From a tenth of a radius on, an outline is doubtful; stated covariances are not used here.
+        # From a tenth of a radius on, an outline is doubtful; given covariances are not used here.
         soft = 1 / (1 + (seen / problem.cones.half_angles / 0.1) ** 2)
         return _Weighting(soft / size * float(np.median(size)), none, 1.0)
 
@@ -224,7 +224,7 @@ def _begin(problem: Problem, start: State) -> _Iterate:
 def _robust_weights(
     problem: Problem, here: _Iterate, weighting: _Weighting, keep: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Which outlines to keep (O,), by the median of those kept so far, and the weights (O,), 0 for the rest."""
+    """Select the outlines (O,) by the median of those selected so far, and their weights (O,), 0 for the rest."""
     d, px = _distances(problem, here, weighting)
     typical = float(np.median(px[keep]))
     typical_d = float(np.median(d[keep])) / 1.54  # the median norm of three standard normals
@@ -233,7 +233,7 @@ def _robust_weights(
 
 
 def _distances(problem: Problem, here: _Iterate, weighting: _Weighting) -> tuple[Array, Array]:
-    """Norm of each outline's residual (O,), in its standard deviations and in px, with pose errors removed."""
+    """Return norms of outlines' residuals (O,), in standard deviations and in px, with pose errors removed."""
     blocks = _blocks(problem, here.rows, weighting.outlines)
     m = marginalise(blocks, weighting.pose_root, weighting.factor)
     xi = pose_errors(blocks, m, np.zeros(problem.size), weighting.factor)
@@ -242,7 +242,7 @@ def _distances(problem: Problem, here: _Iterate, weighting: _Weighting) -> tuple
 
 
 def rms_px(problem: Problem, whitened: Array) -> Array:
-    """RMS (O,) in px, over an outline, of its cone's displacement, given as whitened rows (O, 3)."""
+    """Return the RMS (O,) in px, over an outline, of its cone's displacement, given as whitened rows (O, 3)."""
     r = np.linalg.solve(problem.whiten, whitened[:, :, None])[:, :, 0]
     # Angles are stretched in the image plane by 1 / cos^2 in the radial direction and by 1 / cos across it.
     stretch = problem.focal_px / problem.cones.axes[:, 2] ** 1.5
@@ -278,7 +278,7 @@ def _result(s: Solution, stations: NDArray[np.int64], cost: Cost) -> Registratio
 
 
 def _residuals(s: Solution, given_px: Array) -> tuple[OutlineResidual, ...]:
-    """The outlines' residuals; excluded ones with their reason. `given_px` (O,) is with the camera poses as given."""
+    """List outlines' residuals; excluded ones with a reason. `given_px` (O,) is with the camera poses as given."""
     problem = s.problem
     own = s.linearised.r + np.einsum("okj,oj->ok", s.linearised.A, s.state.poses[problem.image])
     refined_px, keep = rms_px(problem, own), s.weights > 0
@@ -293,7 +293,7 @@ def _residuals(s: Solution, given_px: Array) -> tuple[OutlineResidual, ...]:
 
 
 def _cameras_in_scan(s: Solution, stations: NDArray[np.int64], *, refined: bool) -> Array:
-    """T_scan_camera (N, 4, 4), each through the base of its station; NaN for stations without outlines."""
+    """Return T_scan_camera (N, 4, 4), each through the base of its station; NaN for stations without outlines."""
     T = s.state.cameras(s.problem, refined=refined)
     position = {g: k for k, g in enumerate(s.problem.groups)}
     return np.array(
@@ -305,7 +305,7 @@ def _cameras_in_scan(s: Solution, stations: NDArray[np.int64], *, refined: bool)
 
 
 def _components(s: Solution) -> dict[str, Array]:
-    """(n, n) parts of the common unknowns' covariance by source, from each source's share of the information."""
+    """Return (n, n) parts of the common unknowns' covariance by source, from each one's share of the information."""
     outline, pose = outline_and_pose_shares(s.blocks, s.marginal, s.pose_root, s.outline_factor)
     prior, p = s.problem.prior(), s.problem
     spheres, common = np.zeros_like(prior), np.zeros_like(prior)
@@ -318,7 +318,7 @@ def _components(s: Solution) -> dict[str, Array]:
 
 
 def _starting_state(problem: Problem, assignments: Sequence[Assignment], images: PosedImages) -> State:
-    """Initial bases and scale from the assignments' poses: the mean of the half of each station's images that agree.
+    """Return initial bases and scale by the assignments' poses: means of the half of a station's images that agree.
 
     Raises:
         ComputeError: a station has no image with a pose, or the poses do not determine the scale.
@@ -355,7 +355,7 @@ def _starting_state(problem: Problem, assignments: Sequence[Assignment], images:
 
 
 def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> float:
-    """Initial scale from the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
+    """Return the initial scale by the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
     middle = problem.centres.mean(axis=0)
     upper, lower = 0.0, 0.0
     for g in problem.groups:
@@ -388,7 +388,7 @@ class PoseNoise:
     """Square roots of the covariances of the pose errors, as a sum of parts with one factor each.
 
     `parts` (K, N, 6, 6) must act on different rows (translation, rotation), or there is only one; `least` is the
-    smallest allowed factor; `free` tells whether the factors are estimated.
+    smallest allowed factor; `free` says whether the factors are estimated.
     """
 
     parts: Array
@@ -396,22 +396,22 @@ class PoseNoise:
     free: bool
 
     def root(self, factors: Array) -> Array:
-        """(N, 6, 6) such that root @ root.T is the covariance."""
+        """Return (N, 6, 6) such that root @ root.T is the covariance."""
         return np.einsum("k,knij->nij", factors, self.parts)
 
 
 def no_pose_noise(n_images: int) -> PoseNoise:
-    """No pose errors: poses taken as exact."""
+    """Return no pose errors: poses are taken as exact."""
     return PoseNoise(np.zeros((1, n_images, 6, 6)), 1.0, free=False)
 
 
 def free_poses(n_images: int) -> PoseNoise:
-    """Poses that tell nothing: 0.1 m and 0.1 rad, hundreds of times what the outlines of four spheres leave open."""
+    """Return noise of 0.1 m and 0.1 rad: hundreds of times what the outlines of four spheres leave open."""
     return PoseNoise(np.tile(0.1 * np.eye(6), (1, n_images, 1, 1)), 1.0, free=False)
 
 
 def unknown_pose_noise(n_images: int) -> PoseNoise:
-    """Isotropic noise of position and of orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
+    """Return isotropic noise of position and orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
     parts = np.zeros((2, n_images, 6, 6))
     parts[0, :, :3, :3] = 1e-4 * np.eye(3)
     parts[1, :, 3:, 3:] = 1e-4 * np.eye(3)
@@ -419,7 +419,7 @@ def unknown_pose_noise(n_images: int) -> PoseNoise:
 
 
 def given_pose_noise(covariance: Array) -> PoseNoise:
-    """The stated covariances (N, 6, 6); the residuals can increase them, never decrease them."""
+    """Return the given covariances (N, 6, 6); the residuals can increase them, never decrease them."""
     values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return PoseNoise(root[None], 1.0, free=True)
@@ -432,7 +432,7 @@ def estimate(
 
     Args:
         blocks: linearised at the current solution.
-        noise: the form of the pose noise.
+        noise: the model of the pose noise.
         prior: (n, n) prior information on the common unknowns.
         prior_gradient: (n,) gradient of the prior at the current solution.
         start: current values.
@@ -441,7 +441,7 @@ def estimate(
     Biometrika 58(3), 1971. A wide prior on the logarithm of the outlines' factor limits the influence of few
     residuals.
 
-    The pose noise grows at most fivefold at a time. If residuals are far larger than stated, the minimiser's first
+    The pose noise grows at most fivefold at a time. If residuals are far larger than given, the minimiser's first
     step would otherwise make the poses carry no information, from which neither it nor the solution recovers.
     """
     n_free = len(start[1]) if noise.free else 0

@@ -35,7 +35,7 @@ from service.core.geometry import Array, align_points
 
 
 def main(log: str, seed: int, pipe: Connection) -> None:
-    """Entry point: process (task, job) messages until the other end is closed.
+    """Process (task, job) messages until the other end is closed; this is the entry point.
 
     Sends ("progress", (stage, done, total)) in between, and ("result", value) or ("error", what) at the end of each.
     """
@@ -95,7 +95,7 @@ def _extract(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
 
 
 def _match(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
-    """Matches by descriptor, then those consistent with one epipolar geometry."""
+    """Return the matches by descriptor, then those consistent with one epipolar geometry."""
     options = job["options"]
     matches = match_descriptors(*job["descriptors"])
     verification = pycolmap.TwoViewGeometryOptions()
@@ -122,7 +122,7 @@ _PAIR_SHARE = 60  # tracks per pair, if it has as many
 
 
 def _map_images(job: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Poses and tracks of the largest model of a job's images, adjusted and written into its workspace."""
+    """Return poses and tracks of the largest model of a job's images, adjusted and written into its workspace."""
     camera = CameraModel(**job["camera"])
     features = Features([np.asarray(pixels, dtype=np.float64) for pixels in job["pixels"]], camera)
     matches = [m for m in job["matches"] if len(m[2]) >= _VERIFIED]
@@ -154,7 +154,7 @@ def _laid_over(model: pycolmap.Reconstruction, start: dict[int, Array]) -> None:
 
 
 def _written(model: pycolmap.Reconstruction, job: dict[str, Any]) -> dict[str, Any]:
-    """The model as plain data, and written as COLMAP's files with the images' own names."""
+    """Return the model as plain data, and written as COLMAP's files with the images' own names."""
     poses: dict[int, Any] = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
@@ -176,7 +176,7 @@ def _written(model: pycolmap.Reconstruction, job: dict[str, Any]) -> dict[str, A
 def _mapped(
     job: dict[str, Any], sightings: TrackedFeatures, few: Index, matches: list[Any], progress: Progress
 ) -> tuple[dict[int, Array], int]:
-    """Poses by image index from the mapper's largest model, and the number of models it produced."""
+    """Return poses by image index from the mapper's largest model, and the number of models it produced."""
     workspace = Path(job["workspace"])
     database = workspace / f"{job['mapper']}.db"  # one for each mapper: two may work side by side
     _write_database(job, database, _matches_of(sightings, few, matches, job["pixels"]))
@@ -193,7 +193,7 @@ def _mapped(
 
 
 def _matches_of(sightings: TrackedFeatures, few: Index, matches: list[Any], pixels: list[Any]) -> list[Any]:
-    """The matches between features of the selected tracks."""
+    """Return the matches between features of the selected tracks."""
     chosen = np.zeros(sightings.count, dtype=np.bool_)
     chosen[few] = True
     rows = chosen[sightings.track]
@@ -237,7 +237,7 @@ def _write_database(job: dict[str, Any], path: Path, matches: list[Any]) -> None
 
 
 def _tracks(model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """Points (P, 3), and image index, point index and pixels (our convention) of every observation."""
+    """Return the points (P, 3), and image index, point index and pixels (our convention) of every observation."""
     number = {point_id: k for k, point_id in enumerate(model.points3D)}
     image_index: list[int] = []
     points: list[int] = []
@@ -315,7 +315,7 @@ class Features:
     camera: CameraModel
 
     def of(self, sightings: TrackedFeatures) -> Array:
-        """(O, 2) pixels of the observations."""
+        """Return (O, 2) pixels of the observations."""
         offset = np.concatenate([[0], np.cumsum([len(p) for p in self.pixels])])
         every = np.concatenate([np.empty((0, 2)), *self.pixels])
         return every[offset[sightings.image] + sightings.feature]
@@ -329,14 +329,14 @@ def adjust(
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> pycolmap.Reconstruction | None:
-    """The adjusted model of the images with an initial pose; None if hardly any observation fits.
+    """Adjust the model of the images with an initial pose; None if hardly any observation fits.
 
     A few tracks are adjusted first, until the poses are within the limit of the final adjustment, in which all tracks
-    take part. Observations are selected anew from all of them before each adjustment, so a rough start loses none.
+    take part. Observations are selected again from all of them before each adjustment, so a rough start loses none.
 
     Args:
         start: initial T_world_camera by image index.
-        features: of all images.
+        features: features of all images.
         sightings: all tracks.
         few: numbers of the tracks that are adjusted first.
         settings: SfmOptions as a dictionary.
@@ -394,7 +394,7 @@ class _Fitting:
 def _fitting(
     poses: Mapping[int, Array], features: Features, camera: CameraModel, step: _Step, settings: Mapping[str, Any]
 ) -> _Fitting | None:
-    """The observations that agree with the poses; None if hardly any do."""
+    """Return the observations that agree with the poses; None if hardly any do."""
     sightings, limit_px = step.sightings, step.limit_px
     focal = 0.5 * (camera.fx + camera.fy)
     known = np.zeros(len(features.pixels), dtype=np.bool_)
@@ -421,7 +421,7 @@ def _fitting(
 
 
 def _model(found: _Fitting, features: Features, camera: CameraModel) -> pycolmap.Reconstruction:
-    """COLMAP's model of poses, points and observations; image k gets the id k + 1."""
+    """Return COLMAP's model of poses, points and observations; image k gets the id k + 1."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(to_colmap_camera(camera))
     for k in sorted(found.poses):

@@ -16,7 +16,7 @@ HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1 with its centre at 0.5; ours
 
 
 def to_colmap_camera(camera: CameraModel) -> pycolmap.Camera:
-    """COLMAP's camera for our calibrated one: OPENCV, or FULL_OPENCV if it has more than k1, k2, p1, p2."""
+    """Return COLMAP's camera for our calibrated one: OPENCV, or FULL_OPENCV if it has more than k1, k2, p1, p2."""
     more = [camera.k3, camera.k4, camera.k5, camera.k6]
     return pycolmap.Camera(
         camera_id=1,
@@ -38,10 +38,10 @@ def to_colmap_camera(camera: CameraModel) -> pycolmap.Camera:
 
 
 def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
-    """Our camera from a COLMAP camera.
+    """Convert a COLMAP camera into ours.
 
     Raises:
-        DataError: its model has distortion terms that ours lacks.
+        DataError: its model has distortion terms that ours does not have.
     """
     p = [float(v) for v in camera.params]
     size = (int(camera.width), int(camera.height))
@@ -65,28 +65,28 @@ def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
 
 
 def to_colmap_pose(T_world_camera: Transform) -> pycolmap.Rigid3d:
-    """COLMAP's cam_from_world for our T_world_camera (4, 4)."""
+    """Return COLMAP's cam_from_world for our T_world_camera (4, 4)."""
     T_camera_world = inverse(T_world_camera)
     return pycolmap.Rigid3d(pycolmap.Rotation3d(T_camera_world[:3, :3]), T_camera_world[:3, 3])
 
 
 def from_colmap_pose(cam_from_world: pycolmap.Rigid3d) -> Transform:
-    """T_world_camera (4, 4) from COLMAP's cam_from_world."""
+    """Return T_world_camera (4, 4) from COLMAP's cam_from_world."""
     rotation = np.asarray(cam_from_world.rotation.matrix(), dtype=np.float64)
     return inverse(transform(rotation, np.asarray(cam_from_world.translation, dtype=np.float64)))
 
 
 def from_colmap_pixels(points: Array) -> Array:
-    """Our pixels (N, 2) from COLMAP's image coordinates (N, 2)."""
+    """Return our pixels (N, 2) from COLMAP's image coordinates (N, 2)."""
     return points - HALF_PIXEL
 
 
 def to_colmap_pixels(pixels: Array) -> Array:
-    """COLMAP's image coordinates (N, 2) from our pixels (N, 2)."""
+    """Return COLMAP's image coordinates (N, 2) from our pixels (N, 2)."""
     return pixels + HALF_PIXEL
 
 
-_LARGE_SHARE = 0.125  # of the features that are kept if there are too many
+_LARGE_SHARE = 0.125  # of the features that are selected if there are too many
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,9 +94,9 @@ class SiftFeatures:
     """SIFT features of one image.
 
     Attributes:
-        points: (n, 2) in COLMAP's image coordinates, first pixel's centre at 0.5.
-        scales_px: (n,).
-        orientations_rad: (n,).
+        points: (n, 2) places in COLMAP's image coordinates, first pixel's centre at 0.5.
+        scales_px: (n,) scales.
+        orientations_rad: (n,) orientations.
         descriptors: (n, 128) uint8, with L1-root normalisation.
     """
 
@@ -115,7 +115,7 @@ def extract_sift(grey: NDArray[np.uint8], max_features: int, first_octave: int) 
 
     Args:
         grey: the image.
-        max_features: at most so many.
+        max_features: largest number of features.
         first_octave: -1 doubles the image first, 0 does not.
     """
     extraction = pycolmap.FeatureExtractionOptions()

@@ -85,7 +85,7 @@ class ColmapProcess:
     def _answer(
         self, task: str, job: dict[str, Any], deadline: float, progress: Progress | None
     ) -> tuple[str, Any] | None:
-        """The child's answer to the task; None if it took too long."""
+        """Return the child's answer to the task; None if it took too long."""
         pipe = self._started()
         pipe.send((task, job))
         while pipe.poll(max(0.0, deadline - time.monotonic())):
@@ -143,7 +143,7 @@ _PER_BYTE = 40  # memory per byte of a model's files: an observation takes 24 by
 
 
 def read_model(folder: Path) -> dict[str, Transform]:
-    """T_world_camera (4, 4) by image name from the model in `folder`.
+    """Read T_world_camera (4, 4) by image name from the model in `folder`.
 
     Raises:
         DataError: the model cannot be read.

@@ -38,14 +38,14 @@ class SfmModel:
         mapper: the mapper used; a model by `triangulated` is in metres, in the frame of the given poses.
         T_world_camera: pose of each registered image.
         tracks: triangulated points and their observations; images in the order of T_world_camera.
-        camera: as given, or refined.
+        camera: the camera as given, or refined.
         mean_reprojection_error_px: mean over all observations.
         mean_track_length: mean number of observations per point.
         n_registered: number of images in the model.
         missing: images not in it.
         n_models: number of models that the mapper produced; more than one means that the scene fell apart.
         folder: COLMAP's binary model, with the images' own names.
-        seconds: wall time of each stage that was run; stages whose results were kept are absent.
+        seconds: wall time of each stage that was run; stages whose results were cached are absent.
     """
 
     mapper: Mapper
@@ -66,7 +66,7 @@ class SfmModel:
         return self.tracks.points
 
     def joint_pose_covariance(self, known: CameraCovariance | None = None) -> Array:
-        """(6 N, 6 N) covariance of the poses after a similarity has aligned their positions; in the model's unit.
+        """Return (6 N, 6 N) covariance of poses after a similarity has aligned their positions; the model's unit.
 
         Increments (d, w) of exp(w) R, t + d in the model's axes. `known` is the covariance of a camera that was
         fixed. Takes about a second.
@@ -74,17 +74,17 @@ class SfmModel:
         return similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera, known)
 
     def pose_covariance(self, known: CameraCovariance | None = None) -> Array:
-        """(N, 6, 6) covariance of each pose alone, as in `joint_pose_covariance`."""
+        """Return (N, 6, 6) covariance of each pose alone, as in `joint_pose_covariance`."""
         return blocks(self.joint_pose_covariance(known))
 
 
 @dataclass(frozen=True, slots=True)
 class SfmWorkspace:
-    """Where and how images of one camera are reconstructed.
+    """The folder, camera and settings with which images of one camera are reconstructed.
 
     Attributes:
-        folder: for features, matches, models and COLMAP's logs; created if missing.
-        camera: calibrated at the images' size; fixed unless the options refine it.
+        folder: the folder for features, matches, models and COLMAP's logs; created if missing.
+        camera: the camera, calibrated at the images' size; fixed unless the options refine it.
         options: settings.
         progress: called now and then with (stage, done, total); stage is extract, match, map or adjust, and total is
             0 if COLMAP does not report it.
@@ -106,7 +106,7 @@ def reconstruct(
 ) -> SfmModel:
     """Estimate the poses of images of one calibrated camera, up to a similarity: all stages in one call.
 
-    Equivalent to `FrontEnd` for every image and pair, then `reconstruct_from`. Features and matches are kept in the
+    Equivalent to `FrontEnd` for every image and pair, then `reconstruct_from`. Features and matches are stored in the
     workspace and shared by later calls, whatever the mapper; only missing ones are computed. COLMAP runs in child
     processes, so a crash of COLMAP only fails this call.
 
@@ -151,14 +151,15 @@ def reconstruct_from(
     that made them change a single bit of the model. Two mappers may run in parallel in one workspace.
 
     Args:
-        features: of every image, by name.
-        matches: of the pairs to use (`pairs_of` the images); pairs with images without features are dropped.
+        features: features of every image, by name.
+        matches: matches of the pairs to use (`pairs_of` the images); pairs with images without features are dropped.
         workspace: folder, camera and settings.
         mapper: source of the initial poses: COLMAP's incremental mapper or the global one (GLOMAP), both from the
             images alone; or `triangulated`, from T_world_camera_start. All tracks are triangulated from these poses,
             and poses and points are adjusted together.
-        T_world_camera_start: for `triangulated`: metric poses of the images in one frame, from the corrected robot,
-            good to a few millimetres and a degree. They are the initial values and give the model its frame and
+        T_world_camera_start: the start of `triangulated`: metric poses of the images in one frame, from the corrected
+            robot, good to a few millimetres and a degree. They are the initial values and give the model its frame
+            and
             scale: the adjusted camera positions are aligned to them by a similarity. They do not constrain single
             poses, so their noise does not return. Images without a pose, or without common features with others, are
             missing.
@@ -263,15 +264,15 @@ def _model(
 def similarity_covariance(
     T_world_camera: Array, tracks: Tracks, camera: CameraModel, known: CameraCovariance | None = None
 ) -> Array:
-    """Joint covariance (6 N, 6 N) of poses at the solution of a bundle adjustment with the camera fixed.
+    """Compute the joint covariance (6 N, 6 N) of poses at a bundle adjustment's solution with the camera fixed.
 
-    From the normal equations with the points eliminated and robust weights, allowing for errors shared within a
-    track. Frame and scale are free: the covariance is that of the poses after a similarity has aligned their
+    It follows from the normal equations with the points eliminated and robust weights, allowing for errors shared
+    within a track. Frame and scale are free: the covariance is that of the poses after a similarity has aligned their
     positions with the true ones (inner constraints; Triggs et al., "Bundle adjustment", 2000, 9.2.2).
 
     Args:
         T_world_camera: (N, 4, 4), any unit.
-        tracks: of the same images, in the same frame.
+        tracks: tracks of the same images, in the same frame.
         camera: intrinsics.
         known: covariance of the camera that was fixed; its error moves all poses together, however many images there
             are. None: the camera is taken as exact.
@@ -318,7 +319,7 @@ def similarity_covariance(
 def _pulls(
     state: BundleState, data: AdjustmentData, tracks: Rows, bread: Array, known: CameraCovariance
 ) -> Iterator[Array]:
-    """(6 N,) change of the poses' gradient for each deviation of the camera, with the points adjusted."""
+    """Yield (6 N,) change of the poses' gradient for each deviation of the camera, with the points adjusted."""
     plain = linearise(state, data, Sigmas())["tracks"]
     # The square roots of the robust weights, over the sigma that they were found with.
     root = np.sqrt(_row_squares(tracks) / np.maximum(_row_squares(plain), 1e-300))
@@ -334,7 +335,7 @@ def _row_squares(rows: Rows) -> Array:
 
 
 def blocks(covariance: Array) -> Array:
-    """(N, 6, 6) covariance of each pose, from a joint covariance (6 N, 6 N)."""
+    """Return (N, 6, 6) covariance of each pose, from a joint covariance (6 N, 6 N)."""
     n = len(covariance) // 6
     return np.array([covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
 

@@ -31,7 +31,7 @@ class ImageFeatures:
     """SIFT features of one image (colmap.py says which, if there are too many).
 
     Attributes:
-        width, height: of the image as captured, px.
+        width, height: size of the image as captured, px.
         pixels: (n, 2) float32 in the image as captured, first pixel's centre at 0.
         scales_px: (n,) float32 in the image as captured.
         descriptors: (n, 128) uint8.
@@ -44,7 +44,7 @@ class ImageFeatures:
     descriptors: NDArray[np.uint8] = field(repr=False)
 
     def to_bytes(self) -> bytes:
-        """A NumPy archive (.npz, about 0.1 kB a feature); the same features give the same bytes."""
+        """Return a NumPy archive (.npz, about 0.1 kB a feature); the same features give the same bytes."""
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
@@ -95,7 +95,7 @@ class PairMatches:
 
 
 def pack_matches(matches: Sequence[PairMatches]) -> bytes:
-    """Matches of any number of pairs as a NumPy archive (.npz), sorted by pair, whatever the given order."""
+    """Pack matches of any number of pairs into a NumPy archive (.npz), sorted by pair, whatever the given order."""
     ordered = sorted(matches, key=lambda m: m.pair)
     buffer = io.BytesIO()
     np.savez_compressed(
@@ -130,7 +130,7 @@ def unpack_matches(data: bytes) -> list[PairMatches]:
 
 
 def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """(m, 2) indices of descriptors (n, 128) and (k, 128) that are mutual nearest neighbours and pass the ratio test.
+    """Return indices (m, 2) of descriptors (n, 128) and (k, 128) that are mutual nearest and pass the ratio test.
 
     Products of unsigned bytes are integers below 2^24, which single precision adds exactly in any order: the same
     descriptors give the same matches on every machine.
@@ -177,7 +177,7 @@ class Tracks:
     Attributes:
         image: (O,) index of the image, in the order of the model's poses.
         point: (O,) index of the point.
-        pixels: (O, 2) in the image as captured.
+        pixels: (O, 2) places in the image as captured.
         points: (P, 3) positions in the model's frame and unit; every point has at least two observations.
     """
 

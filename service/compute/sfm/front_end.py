@@ -36,7 +36,7 @@ class FrontEnd:
             matches += front.match_pairs(features, begun)
 
     with `planned = pairs_of(…)` of the planned poses. At the end, the pairs of the images that did arrive are used:
-    already matched ones are kept, `missing_pairs` of them are matched, and `reconstruct_from` maps.
+    already matched ones are used again, `missing_pairs` of them are matched, and `reconstruct_from` maps.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class FrontEnd:
         """Prepare the front end; processes are started with the first work.
 
         Args:
-            camera: calibrated at the images' size.
+            camera: the camera, calibrated at the images' size.
             options: settings.
             processes: number of children working in parallel, each on one core.
             log: file for COLMAP's output; None: a temporary one. Further processes write beside it.
-            child: used instead of own children, and left running.
+            child: a process to use instead of own children, and leave running.
         """
         self._camera = camera
         self._options = options or SfmOptions()
@@ -86,7 +86,7 @@ class FrontEnd:
             child.close()
 
     def extract_features(self, file: Path) -> ImageFeatures:
-        """Features of one image.
+        """Extract the features of one image.
 
         Raises:
             DataError: the image is missing, unreadable or of another size than the camera.
@@ -95,7 +95,7 @@ class FrontEnd:
         return self._extracted(self._children[0], file)
 
     def extract_all(self, files: Mapping[str, Path], progress: Progress | None = None) -> dict[str, ImageFeatures]:
-        """Features of several images by name, in parallel; `progress` is called with ("extract", done, total).
+        """Extract features of images by name, in parallel; `progress` is called with ("extract", done, total).
 
         Raises:
             DataError, ComputeError: as `extract_features`; the message names the image.
@@ -116,7 +116,7 @@ class FrontEnd:
         pairs: Iterable[tuple[str, str]],
         progress: Progress | None = None,
     ) -> list[PairMatches]:
-        """Verified matches of each pair of names, sorted by pair; `progress` is called with ("match", done, total).
+        """Match each pair of names and verify it, sorted by pair; `progress` is called with ("match", done, total).
 
         A pair is matched in the order of its names, so (a, b) and (b, a) give the same result.
 
@@ -150,7 +150,7 @@ class FrontEnd:
         stage: str,
         progress: Progress | None,
     ) -> list[Answer]:
-        """Answers in the order of the items, computed by the children in parallel."""
+        """Return the answers in the order of the items, computed by the children in parallel."""
         free: SimpleQueue[ColmapProcess] = SimpleQueue()
         for child in self._children:
             free.put(child)
@@ -178,7 +178,7 @@ class FrontEnd:
 
 
 def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:
-    """The pairs that have not been matched yet."""
+    """Return the pairs that have not been matched yet."""
     done = {m.pair for m in matches}
     return sorted({(min(pair), max(pair)) for pair in pairs} - done)
 
@@ -188,9 +188,9 @@ class CachedFrontEnd:
     """Features and matches of one camera and one set of options.
 
     Attributes:
-        workspace: existing folder in which they are kept.
-        camera: calibrated at the images' size.
-        settings: with which they are computed.
+        workspace: existing folder in which they are stored.
+        camera: the camera, calibrated at the images' size.
+        settings: settings with which they are computed.
         seconds: wall time of each stage that is run is written here.
     """
 
@@ -202,7 +202,7 @@ class CachedFrontEnd:
     def features(
         self, files: Mapping[str, Path], front: FrontEnd, progress: Progress | None
     ) -> dict[str, ImageFeatures]:
-        """Features of every image; those in the workspace are used if file, camera and settings are the same."""
+        """Return features of every image; stored ones are used if file, camera and settings are the same."""
         folder = self.workspace / "features"
         folder.mkdir(exist_ok=True)
         kept = {name: folder / f"{_key(file, self.camera, self.settings)}.npz" for name, file in files.items()}
@@ -225,7 +225,7 @@ class CachedFrontEnd:
         front: FrontEnd,
         progress: Progress | None,
     ) -> list[PairMatches]:
-        """Matches of exactly these pairs; those in the workspace are used if the features are the same."""
+        """Return the matches of exactly these pairs; those in the workspace are used if the features are the same."""
         kept = self.workspace / "matches.npz"
         stamp = self.workspace / "matches.json"
         recipe = json.dumps(

@@ -30,11 +30,11 @@ class SfmOptions:
         filter_error_px: observations with larger errors are dropped before the final bundle adjustment.
         min_track: least number of views of a point in the final bundle adjustment.
         loss_px: scale of the final bundle adjustment's robust (Cauchy) loss.
-        threads: of extraction and matching.
-        mapping_threads: of mapping and bundle adjustment. With one, the same features give the same model bit for
-            bit; with more, sums depend on the order in which threads finish.
+        threads: number of threads of extraction and matching.
+        mapping_threads: number of threads of mapping and bundle adjustment. With one, the same features give the same
+            model bit for bit; with more, sums depend on the order in which threads finish.
         refine: intrinsics that the final bundle adjustment may change.
-        seed: of all random choices.
+        seed: seed of all random choices.
         timeout_s: time limit of one stage.
     """
 
@@ -58,7 +58,7 @@ Effort = Literal["quick", "normal", "quality"]
 
 
 def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothing", threads: int = 2) -> SfmOptions:
-    """Settings for images of this camera.
+    """Return the settings for images of this camera.
 
     Camera positions were off by 0.017–0.028 mm (normal) and 0.013 mm (quality) on 20 rendered images 1920 px wide of
     a scene 0.65 m away (bench/poses/sfm.py); the errors are noise, so more features reduce them.
@@ -83,7 +83,7 @@ def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothin
 
 
 def reduction(max_image_size: int, width: int, height: int) -> float:
-    """Image pixels per pixel at which features are extracted."""
+    """Return the image pixels per pixel at which features are extracted."""
     return max(1.0, max(width, height) / max_image_size) if max_image_size else 1.0
 
 
@@ -98,16 +98,16 @@ def choose_pairs(
     *,
     stations: Mapping[str, str] | None = None,
 ) -> list[tuple[int, int]]:
-    """Index pairs worth matching: nearest viewing directions around the scene, in one connected graph.
+    """Choose index pairs worth matching: nearest viewing directions around the scene, in one connected graph.
 
     The scene centre is the point nearest to all optical axes. Images without a prior pose are paired with all.
 
     Args:
-        names: of the images.
+        names: names of the images.
         prior: T_world_camera of images; None pairs all with all.
         neighbours: least number of images that each one is paired with.
         max_angle_deg: largest angle between the viewing directions of a pair.
-        stations: frame of each image's prior pose, if there are several; all pairs across frames are kept, since
+        stations: frame of each image's prior pose, if there are several; all pairs across frames are chosen, since
             nothing is known about them.
     """
     if stations is not None and len({stations.get(name) for name in names}) > 1:
@@ -141,9 +141,9 @@ def pairs_of(
     *,
     stations: Mapping[str, str] | None = None,
 ) -> list[tuple[str, str]]:
-    """Pairs of names worth matching (see `choose_pairs`): a function only of the set of images and their poses.
+    """Return pairs of names worth matching (see `choose_pairs`); they depend only on the set of images and poses.
 
-    Before the images are taken, the planned poses give the pairs with which matching can begin; at the end, the pairs
+    Before the images are taken, the planned poses give the pairs with which matching can start; at the end, the pairs
     of the images that were taken are the ones used.
     """
     order = sorted(names)
@@ -152,7 +152,7 @@ def pairs_of(
 
 
 def _angles_deg(rays: Array, others: Array) -> Array:
-    """(K, L) angles between unit vectors (K, 3) and (L, 3)."""
+    """Return (K, L) angles between unit vectors (K, 3) and (L, 3)."""
     return np.degrees(np.arccos(np.clip(rays @ others.T, -1, 1)))
 
 
@@ -178,7 +178,7 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
 
 
 def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int) -> set[tuple[int, int]]:
-    """The nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
+    """Return the nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
     parts = _Parts(n)
     for i, j in chosen:
         parts.join(i, j)
@@ -203,14 +203,14 @@ def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int
 class _Parts:
     """The connected parts of a graph that only gains edges.
 
-    SciPy's would cost half a second of imports, and the state of a run is told with these pairs.
+    SciPy's would cost half a second of imports, and the state of a run is reported with these pairs.
     """
 
     def __init__(self, nodes: int) -> None:
         self._towards = list(range(nodes))
 
     def of(self, node: int) -> int:
-        """The node that stands for the part to which this one belongs."""
+        """Return the node that stands for the part to which this one belongs."""
         towards = self._towards
         while towards[node] != node:
             towards[node] = node = towards[towards[node]]

@@ -35,7 +35,7 @@ class TrackedFeatures:
     count: int
 
     def kept(self, observations: NDArray[np.bool_], least: int = 2) -> tuple[TrackedFeatures, Index]:
-        """The selected observations of tracks that still have at least `least` of them, and these tracks' numbers."""
+        """Select observations of tracks that still have `least` of them or more; return these tracks' numbers too."""
         length = np.bincount(self.track[observations], minlength=self.count)
         tracks = np.flatnonzero(length >= least)
         number = np.full(self.count, -1, dtype=np.int64)
@@ -77,9 +77,9 @@ def thinned(sightings: TrackedFeatures, pixels: Array, share: int, pair_share: i
 
     Args:
         sightings: all tracks.
-        pixels: (O, 2) of the observations.
-        share: tracks kept per image, spread over a grid of cells.
-        pair_share: tracks kept per pair of images, if it has as many.
+        pixels: (O, 2) places of the observations.
+        share: number of tracks per image, spread over a grid of cells.
+        pair_share: number of tracks per pair of images, if it has as many.
         size: width and height of the images, px.
     """
     length = np.bincount(sightings.track, minlength=sightings.count)
@@ -103,7 +103,7 @@ def thinned(sightings: TrackedFeatures, pixels: Array, share: int, pair_share: i
 def _of_pairs(
     sightings: TrackedFeatures, rank: Index, keep: NDArray[np.bool_], share: int, n_images: int
 ) -> NDArray[np.bool_]:
-    """Tracks that pairs of images need beyond those already kept, so that no weak connection is lost."""
+    """Select tracks that pairs of images need beyond those already selected, so that no weak connection is lost."""
     seen = np.zeros((n_images, sightings.count), dtype=np.bool_)
     seen[sightings.image, sightings.track] = True
     order = np.argsort(rank, kind="stable")
@@ -122,7 +122,7 @@ def _of_pairs(
 
 
 def triangulate(poses: Array, plane: Array, sightings: TrackedFeatures, sigma: float) -> tuple[Array, Array]:
-    """Scene points (P, 3) by robust triangulation from known poses, and the error of each observation.
+    """Triangulate scene points (P, 3) robustly from known poses; return the error of each observation too.
 
     First the point nearest to all rays, then Gauss–Newton steps on the reprojection errors; both use Cauchy weights,
     which favour the position on which most observations of a track agree.
@@ -162,7 +162,7 @@ def triangulate(poses: Array, plane: Array, sightings: TrackedFeatures, sigma: f
 
 
 def reprojection(poses: Array, points: Array, plane: Array, sightings: TrackedFeatures) -> tuple[Array, Array, Array]:
-    """Length (O,) and components (O, 2) of the reprojection errors, and their derivatives (O, 2, 3) by the points."""
+    """Return reprojection errors' length (O,) and components (O, 2), and derivatives (O, 2, 3) by the points."""
     R = poses[sightings.image, :3, :3]
     c = np.einsum("oji,oj->oi", R, points[sightings.track] - poses[sightings.image, :3, 3])
     front = c[:, 2] > 1e-9
@@ -177,7 +177,7 @@ def reprojection(poses: Array, points: Array, plane: Array, sightings: TrackedFe
 
 
 def wide_enough(poses: Array, points: Array, sightings: TrackedFeatures) -> NDArray[np.bool_]:
-    """(P,) whether the angle between the rays to a point is large enough."""
+    """Return (P,) whether the angle between the rays to a point is large enough."""
     ray = points[sightings.track] - poses[sightings.image, :3, 3]
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     mean = _summed(ray, sightings)
@@ -189,14 +189,14 @@ def wide_enough(poses: Array, points: Array, sightings: TrackedFeatures) -> NDAr
 
 
 def _summed(values: Array, sightings: TrackedFeatures) -> Array:
-    """Sums of (O, …) over the observations of each track."""
+    """Return the sums of (O, …) over the observations of each track."""
     flat = values.reshape(len(values), -1)
     sums = [np.bincount(sightings.track, flat[:, k], minlength=sightings.count) for k in range(flat.shape[1])]
     return np.array(sums, dtype=np.float64).T.reshape(sightings.count, *values.shape[1:])
 
 
 def _solved(A: Array, b: Array) -> Array:
-    """Solutions x (P, 3) of A x = b with slight damping, so that a point without parallax stays finite."""
+    """Return the solutions x (P, 3) of A x = b with slight damping, so that a point without parallax stays finite."""
     trace = np.trace(A, axis1=1, axis2=2)
     damped: Array = A + (1e-9 * trace + 1e-300)[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(damped, b[:, :, None])[:, :, 0], dtype=np.float64)

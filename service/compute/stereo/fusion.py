@@ -34,8 +34,8 @@ class Field:
 
     Attributes:
         blocks: (B, 3) integer place of each block; voxel (i, j, k) of it is at (SIDE block + (i, j, k)) voxel_m.
-        distance: (B, SIDE³) in voxels, within ±TRUNCATION.
-        weight: (B, SIDE³).
+        distance: (B, SIDE³) distances in voxels, within ±TRUNCATION.
+        weight: (B, SIDE³) weights.
         maps: (B, SIDE³) number of depth maps that contributed.
         voxel_m: edge of a voxel.
     """
@@ -51,7 +51,7 @@ def fused(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Field:
     """Fuse depth maps.
 
     Args:
-        maps: of one scene.
+        maps: depth maps of one scene.
         voxel_m: edge of a voxel.
         least_maps: blocks that fewer maps have a point in are left out.
 
@@ -73,7 +73,7 @@ def fused(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Field:
 
 
 def _blocks(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Ints:
-    """(B, 3) blocks within the truncation of points of enough maps."""
+    """Return (B, 3) blocks within the truncation of points of enough maps."""
     edge = SIDE * voxel_m
     reach = TRUNCATION * voxel_m
     found: list[Ints] = []
@@ -145,7 +145,7 @@ def _pixels(one: DepthMap, points: Array) -> tuple[Array, Array]:
 
 
 def _sampled(depth: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (N,) between pixels; NaN where one of the four around is unknown."""
+    """Return the depth (N,) between pixels; NaN where one of the four around is unknown."""
     columns = min(len(u), _MOST_COLUMNS)
     rows = -(-len(u) // columns)
     places = np.full((2, rows * columns), -10.0, dtype=np.float32)
@@ -162,7 +162,7 @@ _ROUND = 1e-3  # voxels: vertices of neighbouring tiles closer than this are one
 
 
 def surface_of(found: Field, least_maps: int) -> Surface:
-    """The surface where the distance is zero, in metres, faces outward.
+    """Return the surface where the distance is zero, in metres, faces outward.
 
     Args:
         found: the field.
@@ -196,7 +196,7 @@ def surface_of(found: Field, least_maps: int) -> Surface:
 
 
 def _whole_cells(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where all eight corners of a cell are known, at its last corner, which is where scikit-image looks."""
+    """Find where all eight corners of a cell are known, at its last corner, which is where scikit-image looks."""
     cells = np.zeros_like(known)
     cells[1:, 1:, 1:] = True
     for i, j, k in np.ndindex(2, 2, 2):
@@ -207,7 +207,7 @@ def _whole_cells(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _tile(
     found: Field, order: dict[tuple[int, ...], int], first: Ints, least_maps: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Distances and known voxels of a tile, with one layer of its neighbours."""
+    """Return the distances and known voxels of a tile, with one layer of its neighbours."""
     edge = SIDE * _TILE + 1
     distance = np.full((edge + SIDE,) * 3, 1.0, dtype=np.float32)
     known = np.zeros(distance.shape, dtype=np.bool_)
@@ -224,7 +224,7 @@ def _tile(
 
 
 def _merged(vertices: NDArray[np.float64], faces: Ints) -> Surface:
-    """With vertices at the same place made one."""
+    """Merge vertices at the same place."""
     keys = np.round(vertices / _ROUND).astype(np.int64)
     _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1)[faces]
@@ -233,7 +233,7 @@ def _merged(vertices: NDArray[np.float64], faces: Ints) -> Surface:
 
 
 def _without_crumbs(surface: Surface) -> Surface:
-    """Without pieces that are much smaller than the largest."""
+    """Drop pieces that are much smaller than the largest."""
     n, faces = len(surface.vertices_m), surface.faces
     rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
     _, piece = connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), (n, n)), directed=False)

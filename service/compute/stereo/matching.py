@@ -36,7 +36,7 @@ class DepthMap:
     weight: float
 
     def points_m(self, step: int) -> Array:
-        """(N, 3) every `step`-th known pixel's point in the world."""
+        """Return (N, 3) every `step`-th known pixel's point in the world."""
         v, u = (k.ravel() for k in np.mgrid[: self.depth_m.shape[0] : step, : self.depth_m.shape[1] : step])
         z = self.depth_m[v, u].astype(np.float64)
         known = np.isfinite(z)
@@ -47,7 +47,7 @@ class DepthMap:
 
 
 def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
-    """Depth of the left image of a pair that looks at an object at this distance; None if too little agrees.
+    """Return the depth of a pair's left image of an object at this distance; None if too little agrees.
 
     The range of disparities is found in small images first. The weight of a depth is the square of the change of
     disparity (px) per metre of depth at the object: the inverse variance, up to the variance of the matching.
@@ -67,7 +67,7 @@ def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
 
 
 def depth_map(pair: Rectified, disparity_px: Disparity, distance_m: float) -> DepthMap:
-    """The depth map of a pair's left image from its disparities (H, W); `distance_m` is that of the object."""
+    """Return the depth map of a pair's left image from its disparities (H, W); `distance_m` is that of the object."""
     depth = pair.depth_m(_without_edges(disparity_px))
     slope = pair.f_px * pair.baseline_m / distance_m**2
     return DepthMap(depth, pair.left_camera, pair.T_world_left, slope**2)
@@ -79,7 +79,7 @@ def _reduced(image: Image) -> Image:
 
 
 def _agreed(left: Image, right: Image, first_px: float, last_px: float, block: int) -> Disparity:
-    """Disparities (H, W) of the left image that the right one confirms; NaN elsewhere."""
+    """Return the disparities (H, W) of the left image that the right one confirms; NaN elsewhere."""
     lowest = int(np.floor(first_px))
     count = 16 * max(1, int(np.ceil((last_px - lowest + 1) / 16)))
     matcher = matcher_of(lowest, count, block)
@@ -93,7 +93,7 @@ def _agreed(left: Image, right: Image, first_px: float, last_px: float, block: i
 
 
 def matcher_of(lowest_px: int, count: int, block: int) -> cv2.StereoSGBM:
-    """The search over so many disparities from the lowest one."""
+    """Return the search over so many disparities from the lowest one."""
     return cv2.StereoSGBM.create(
         minDisparity=lowest_px,
         numDisparities=count,
@@ -107,7 +107,7 @@ def matcher_of(lowest_px: int, count: int, block: int) -> cv2.StereoSGBM:
 
 
 def confirmed(forth: Disparity, back: Disparity) -> Disparity:
-    """The disparities (H, W) of the left image with which those of the right one agree; NaN elsewhere."""
+    """Return the disparities (H, W) of the left image with which those of the right one agree; NaN elsewhere."""
     columns = np.arange(forth.shape[1], dtype=np.float32)[None, :] - forth
     rows = np.broadcast_to(np.arange(forth.shape[0], dtype=np.float32)[:, None], forth.shape)
     there = cv2.remap(
@@ -121,7 +121,7 @@ def confirmed(forth: Disparity, back: Disparity) -> Disparity:
 
 
 def matched(matcher: cv2.StereoSGBM, left: Image, right: Image, lowest: int) -> Disparity:
-    """Disparities (H, W) of the left image, NaN where none was found or only a speckle."""
+    """Return the disparities (H, W) of the left image, NaN where none was found or only a speckle."""
     sixteenths = matcher.compute(left, right)
     none = 16 * (lowest - 1)
     cv2.filterSpeckles(sixteenths, none, _SPECKLE_PX, int(16 * _SPECKLE_STEP_PX))
@@ -131,7 +131,7 @@ def matched(matcher: cv2.StereoSGBM, left: Image, right: Image, lowest: int) -> 
 
 
 def _without_edges(disparity: Disparity) -> Disparity:
-    """Without pixels at jumps of disparity, where a block covers two surfaces."""
+    """Drop pixels at jumps of disparity, where a block covers two surfaces."""
     filled = np.nan_to_num(disparity, nan=-1e6)
     kernel = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(filled, kernel), cv2.dilate(filled, kernel)
@@ -148,7 +148,7 @@ _FEWEST_PIXELS = 2000  # pixels that agree; a pair with fewer does not show the 
 
 
 def guided_depth(pair: Rectified, guess: RayMesh, distance_m: float) -> DepthMap | None:
-    """Depth of the left image of a pair, searched around a guessed surface; None if too little agrees.
+    """Return the depth of the left image of a pair, searched around a guessed surface; None if too little agrees.
 
     One image is drawn as the other camera would see it if the guess were true, and then matched with the other.
     """
@@ -170,7 +170,7 @@ def _flipped(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _disparity_of(guess: RayMesh, camera: CameraModel, T_world_camera: Transform, pair: Rectified) -> Disparity:
-    """Disparities (H, W) that the guess would have in one of the two cameras; NaN where it is not met."""
+    """Return the disparities (H, W) that the guess would have in one of the two cameras; NaN where it is not met."""
     depth = _depth_of(guess, camera, T_world_camera)
     with np.errstate(divide="ignore", invalid="ignore"):
         sparse = (pair.f_px * pair.baseline_m / depth + pair.left_px - pair.right_px).astype(np.float32)
@@ -185,14 +185,14 @@ def _disparity_of(guess: RayMesh, camera: CameraModel, T_world_camera: Transform
 
 
 def _depth_of(guess: RayMesh, camera: CameraModel, T_world_camera: Transform) -> NDArray[np.float64]:
-    """Depth along z of every _STEP-th pixel; NaN where no surface is met."""
+    """Return the depth along z of every _STEP-th pixel; NaN where no surface is met."""
     v, u = np.mgrid[: camera.height : _STEP, : camera.width : _STEP]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     return guess.depths(T_world_camera, rays.reshape(-1, 3)).reshape(u.shape)
 
 
 def _searched(one: NDArray[np.uint8], two: NDArray[np.uint8], guess: Disparity) -> Disparity:
-    """Disparities (H, W) of image `one` within SPAN_PX of the guess in its pixels; NaN elsewhere."""
+    """Return the disparities (H, W) of image `one` within SPAN_PX of the guess in its pixels; NaN elsewhere."""
     height, width = one.shape
     border = 2 * SPAN_PX
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -225,7 +225,7 @@ _FEWEST_KNOWN = 0.5  # share of the window that must be known
 
 
 def refined(left: Image, right: Image, disparity: Disparity) -> Disparity:
-    """Disparities (H, W) of the left image, refined; as they were where the images say too little.
+    """Return the disparities (H, W) of the left image, refined; as they were where the images say too little.
 
     NaN stays NaN, and becomes of what moves by more than _FARTHEST_PX.
     """
@@ -258,5 +258,5 @@ def refined(left: Image, right: Image, disparity: Disparity) -> Disparity:
 
 
 def _mean(image: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The mean over the window around each pixel."""
+    """Return the mean over the window around each pixel."""
     return np.asarray(cv2.boxFilter(image, cv2.CV_32F, (_WINDOW, _WINDOW)), dtype=np.float32)

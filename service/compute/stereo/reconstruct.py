@@ -1,4 +1,4 @@
-"""From posed images to a mesh: pairs, depth maps, fusion, surface; once more, finely, near it; then what is steep."""
+"""Reconstructs a mesh from posed images: pairs, depth maps, fusion; again, finely, near it; then steep parts."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Progress = Callable[[str, int, int], None]
 
 
 def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
-    """The surface that posed images of pinhole cameras show, in the frame and unit of the poses.
+    """Reconstruct the surface that posed images of pinhole cameras show, in the frame and unit of the poses.
 
     A first surface from small images, closed where nothing was matched, is the guess around which larger images are
     matched. The depth of both is fused: the first holds more of what is steep, the second is finer. If there are many
-    images, what the fused surface lacks where it is steep is searched for last.
+    images, the steep parts that the fused surface misses are searched for last.
 
     Raises:
         ComputeError: no two images can be matched, or no surface comes out.
@@ -75,7 +75,7 @@ def _distance_m(views: Sequence[StereoView], one: int, two: int, centre_m: Array
 
 
 def _footprint_m(views: Sequence[StereoView], centre_m: Array) -> float:
-    """What a pixel covers at the object."""
+    """Return the width, in metres, that a pixel covers at the object."""
     return float(np.median([np.linalg.norm(view.eye_m - centre_m) / view.camera.fx for view in views]))
 
 

@@ -35,7 +35,7 @@ class StereoView:
 
 
 def looked_at_m(views: Sequence[StereoView]) -> Array:
-    """(3,) the point nearest to all optical axes, in the least-squares sense.
+    """Return (3,) the point nearest to all optical axes, in the least-squares sense.
 
     Raises:
         ComputeError: the axes are parallel, or meet behind a camera.
@@ -55,7 +55,7 @@ def looked_at_m(views: Sequence[StereoView]) -> Array:
 
 
 def stereo_pairs(views: Sequence[StereoView]) -> tuple[tuple[int, int], ...]:
-    """Pairs of views by index, each with those whose angle at the object is nearest to BEST_DEG.
+    """Return the pairs of views by index, each with those whose angle at the object is nearest to BEST_DEG.
 
     A view without a partner up to _FALLBACK_DEG gets the nearest up to WIDEST_DEG.
 
@@ -102,7 +102,7 @@ class Rectified:
         T_world_left, T_world_right: poses of both cameras, whose x runs along the baseline.
         f_px: focal length of both.
         left_px, right_px: x of the principal points; y_px of both.
-        baseline_m: between the cameras.
+        baseline_m: distance between the cameras.
     """
 
     left: NDArray[np.uint8] = field(repr=False)
@@ -128,11 +128,11 @@ class Rectified:
         return replace(self.left_camera, cx=self.right_px)
 
     def disparity(self, depth_m: float) -> float:
-        """Column in the left image minus that in the right one of a point at this depth, in pixels."""
+        """Return the column in the left image minus that in the right one of a point at this depth, in pixels."""
         return self.f_px * self.baseline_m / depth_m + self.left_px - self.right_px
 
     def depth_m(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth (H, W) of disparities (H, W); NaN where they are, and behind the camera."""
+        """Return the depth (H, W) of disparities (H, W); NaN where they are, and behind the camera."""
         true = disparity_px - np.float32(self.left_px - self.right_px)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(true > 0, np.float32(self.f_px * self.baseline_m) / true, np.nan).astype(np.float32)
@@ -175,13 +175,13 @@ def rectified(one: StereoView, two: StereoView, centre_m: Array) -> Rectified:
 
 
 def _projected(directions: Array, R: Array, f: float) -> Array:
-    """Pixels (..., 2) of directions (..., 3) of the world, from the principal point."""
+    """Return the pixels (..., 2) of directions (..., 3) of the world, from the principal point."""
     p = directions @ R
     return f * p[..., :2] / p[..., 2:]
 
 
 def _corners(view: StereoView, R: Array, f: float) -> Array:
-    """(4, 2) corners of an image in the rectified one, from its principal point."""
+    """Return (4, 2) corners of an image in the rectified one, from its principal point."""
     camera = view.camera
     w, h = camera.width - 0.5, camera.height - 0.5
     pixels = np.array([[-0.5, -0.5, 1.0], [w, -0.5, 1.0], [w, h, 1.0], [-0.5, h, 1.0]])
@@ -191,7 +191,7 @@ def _corners(view: StereoView, R: Array, f: float) -> Array:
 def _warped(
     view: StereoView, R: Array, f: float, principal: Array, size: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The image turned to the axes R, and where it has pixels."""
+    """Return the image turned to the axes R, and where it has pixels."""
     K = np.array([[f, 0.0, principal[0]], [0.0, f, principal[1]], [0.0, 0.0, 1.0]])
     H = K @ R.T @ view.T_world_camera[:3, :3] @ np.linalg.inv(view.camera.matrix)
     image = cv2.warpPerspective(view.image, H, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -31,9 +31,9 @@ _PER_STEP, _MOST = 0.06, 0.48  # cost of neighbours that move differently, by a 
 _THROUGH, _MOST_THROUGH = 0.15, 6  # cost of each view that sees through a place, up to so many
 _STAYS, _MOST_STAYS = 0.5, 3.0  # cost of a known vertex that moves, by a step and by many
 _NO_HOLD, _FULL_HOLD = 0.4, 0.8  # evidence up to which a vertex is not held in place then, and from which it is fully
-_LEAST_EVIDENCE = 0.2  # of a place that is kept
+_LEAST_EVIDENCE = 0.2  # of a place that is accepted
 _STEEP = 0.6  # cosine at the second view: what two views see less steeply, rectified matching would have found
-_FEW_THROUGH = 2  # views that see through a place that is not kept
+_FEW_THROUGH = 2  # views that see through a place that is not accepted
 _FIELD = 0.5  # of the views, that have a place in their image: the object, not the room
 
 Ints = NDArray[np.int64]
@@ -49,12 +49,12 @@ class _Opening:
 
 
 def completed(known: Surface, views: Sequence[StereoView], footprint_m: float) -> Surface:
-    """The surface with what it lacks where it is steep, as further faces that do not share its vertices.
+    """Complete a surface where it is steep, by further faces that do not share its vertices.
 
     Args:
         known: the fused surface.
-        views: that it was made from.
-        footprint_m: what a pixel of them covers at the object.
+        views: the views from which it was made.
+        footprint_m: width that a pixel of them covers at the object.
     """
     guess = closed(known)
     seen = RayMesh(known.vertices_m, known.faces)
@@ -80,7 +80,7 @@ def completed(known: Surface, views: Sequence[StereoView], footprint_m: float) -
 def _opening(
     known: Surface, guess: Surface, edges: Ints, photographs: Sequence[Photograph], far_m: float
 ) -> _Opening:
-    """Vertices of the guess far from the known surface, and a ring of others around them."""
+    """Return the vertices of the guess far from the known surface, and a ring of others around them."""
     is_open = ~np.isfinite(PointIndex(known.vertices_m).nearest(guess.vertices_m, far_m)[0])
     within = np.sum([one.seen(guess.vertices_m)[3] for one in photographs], axis=0)
     is_open &= within >= _FIELD * len(photographs)
@@ -102,7 +102,7 @@ def _moved(
     moves_m: Array,
     spacing_m: float,
 ) -> tuple[Array, Array]:
-    """(N,) metres that each vertex is to move along its normal, and the evidence for it."""
+    """Return (N,) metres that each vertex is to move along its normal, and the evidence for it."""
     alike = averaged(evidence(photographs, points_m, normals, moves_m, spacing_m)[0], part.edges, 1)
     places = points_m[:, None] + moves_m[:, None] * normals[:, None]
     costs = 1 - alike + _THROUGH * np.minimum(seen_through(photographs, places), _MOST_THROUGH)
@@ -116,7 +116,7 @@ def _moved(
 
 
 def _lowest(belief: NDArray[np.float32], best: Ints, moves_m: Array) -> Array:
-    """(N,) the move at the minimum of the parabola through the best label and its neighbours."""
+    """Return (N,) the move at the minimum of the parabola through the best label and its neighbours."""
     row, inner = np.arange(len(best)), best.clip(1, len(moves_m) - 2)
     before, at, after = (belief[row, inner + k].astype(np.float64) for k in (-1, 0, 1))
     curvature = before - 2 * at + after
@@ -126,7 +126,7 @@ def _lowest(belief: NDArray[np.float32], best: Ints, moves_m: Array) -> Array:
 
 
 def _supported(photographs: Sequence[Photograph], points_m: Array, normals: Array, found: Array) -> NDArray[np.bool_]:
-    """Which vertices are steep, have evidence, and are not seen through."""
+    """Return which vertices are steep, have evidence, and are not seen through."""
     second = best_views(photographs, points_m, normals)[1][:, 1]
     return (
         (second > 0)
@@ -137,7 +137,7 @@ def _supported(photographs: Sequence[Photograph], points_m: Array, normals: Arra
 
 
 def _with(known: Surface, vertices_m: Array, faces: Ints, part: _Opening, kept: NDArray[np.bool_]) -> Surface:
-    """The known surface and the faces that have a kept vertex, and else only known ones."""
+    """Return the known surface with the faces that have a vertex in `kept`, and else only known ones."""
     is_kept, usable = (np.zeros(len(vertices_m), dtype=np.bool_) for _ in range(2))
     is_kept[part.vertices[kept]] = True
     usable[part.vertices[kept | part.stays]] = True
@@ -159,7 +159,7 @@ _DEPTH = 9  # of the octree: cells of a 512th of the scene; a guess needs no mor
 
 
 def closed(surface: Surface) -> Surface:
-    """A surface without holes near the given one; what it adds is a guess and never a result."""
+    """Return a surface without holes near the given one; what it adds is a guess and never a result."""
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as name:
         points, mesh = Path(name) / "points.ply", Path(name) / "mesh.ply"
         _write_points(points, surface.vertices_m, surface.vertex_normals)
@@ -193,19 +193,19 @@ _MESSAGE_ROUNDS = 15
 
 
 def edges_of(faces: Ints) -> Ints:
-    """(E, 2) each edge of a triangle mesh once, the smaller index first."""
+    """Return (E, 2) each edge of a triangle mesh once, the smaller index first."""
     ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     ends = np.unique(ends, axis=0)
     return ends[ends[:, 0] != ends[:, 1]]
 
 
 def neighbours(edges: Ints, count: int) -> csr_matrix:
-    """(V, V) 1 for each two of V vertices that share one of the edges (E, 2), else 0."""
+    """Return (V, V) 1 for each two of V vertices that share one of the edges (E, 2), else 0."""
     return _incidence(np.concatenate([edges, edges[:, ::-1]]), (count, count))
 
 
 def averaged(values: NDArray[np.floating], edges: Ints, rounds: int) -> Array:
-    """Values (V, ...) after so many means of each vertex with its neighbours."""
+    """Return the values (V, ...) after so many means of each vertex with its neighbours."""
     out, count = np.asarray(values, dtype=np.float64), len(values)
     mean = neighbours(edges, count) + identity(count, format="csr")
     mean = diags(1 / np.asarray(mean.sum(axis=1)).ravel()) @ mean
@@ -215,11 +215,11 @@ def averaged(values: NDArray[np.floating], edges: Ints, rounds: int) -> Array:
 
 
 def beliefs(costs: Floats, edges: Ints, per_step: float, most: float) -> Floats:
-    """(V, L) the cost of each label at each vertex, when all others choose as suits them.
+    """Return (V, L) the cost of each label at each vertex, when all others choose as suits them.
 
     Args:
-        costs: (V, L) of a label at a vertex alone.
-        edges: (E, 2) of neighbours.
+        costs: (V, L) cost of a label at a vertex alone.
+        edges: (E, 2) pairs of neighbours.
         per_step: cost of neighbours whose labels differ by one.
         most: cost of neighbours whose labels differ by much.
     """
@@ -276,8 +276,8 @@ class Photograph:
 
     Attributes:
         detail: (H, W) grey values without shading.
-        farthest: depth of what is known around a pixel; infinite where nothing is.
-        nearest: the same; 0 where nothing is.
+        farthest: greatest depth of what is known around a pixel; infinite where nothing is.
+        nearest: least depth of what is known around a pixel; 0 where nothing is.
     """
 
     view: StereoView
@@ -286,7 +286,7 @@ class Photograph:
     nearest: Floats = field(repr=False)
 
     def seen(self, points_m: Array) -> tuple[Array, Array, Ints, NDArray[np.bool_]]:
-        """Pixels (..., 2), depth, place in the known depths (..., 2) and whether in the image, of points (..., 3)."""
+        """Project points (..., 3): pixels (..., 2), depth, place in the known depths (..., 2), if in the image."""
         camera = apply(inverse(self.view.T_world_camera), points_m.reshape(-1, 3)).reshape(points_m.shape)
         of = self.view.camera
         z = np.maximum(camera[..., 2], 1e-9)
@@ -298,7 +298,7 @@ class Photograph:
 
 
 def photograph(view: StereoView, known: RayMesh) -> Photograph:
-    """A view beside the surface that is known already."""
+    """Return a view beside the surface that is known already."""
     grey = view.image.astype(np.float32)
     detail = cv2.GaussianBlur(grey, (0, 0), _FINE) - cv2.GaussianBlur(grey, (0, 0), _COARSE)
     camera = view.camera
@@ -314,7 +314,7 @@ def photograph(view: StereoView, known: RayMesh) -> Photograph:
 
 
 def seen_through(photographs: Sequence[Photograph], points_m: Array) -> Ints:
-    """(N, ...) how many photographs show a known surface behind each point (N, ..., 3)."""
+    """Return (N, ...) how many photographs show a known surface behind each point (N, ..., 3)."""
     out = np.zeros(points_m.shape[:-1], dtype=np.int64)
     for begin in range(0, len(points_m), _LISTED):
         part = slice(begin, begin + _LISTED)
@@ -326,7 +326,7 @@ def seen_through(photographs: Sequence[Photograph], points_m: Array) -> Ints:
 
 
 def best_views(photographs: Sequence[Photograph], points_m: Array, normals: Array) -> tuple[Ints, Array]:
-    """(N, VIEWS) the views that face each place most, with parallax between them, and their cosines.
+    """Return (N, VIEWS) the views that face each place most, with parallax between them, and their cosines.
 
     -1 and 0 where there are no more. What lies behind the known surface is not seen. The memory that this takes does
     not grow with the places times the views.
@@ -361,7 +361,7 @@ def _best_views_at_once(photographs: Sequence[Photograph], points_m: Array, norm
 
 
 def _parallax(slants: Array, one: Array, cosines: Array) -> Array:
-    """(N, K) how far apart two views see a place, in lengths of the surface as they show it, for a unit move."""
+    """Return (N, K) how far apart two views see a place, in lengths on the surface as they show it, per unit move."""
     apart = slants - one[:, None]
     steep = one / np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-9)
     along = np.einsum("nki,ni->nk", apart, steep)
@@ -372,7 +372,7 @@ def _parallax(slants: Array, one: Array, cosines: Array) -> Array:
 def evidence(
     photographs: Sequence[Photograph], points_m: Array, normals: Array, moves_m: Array, spacing_m: float
 ) -> tuple[Floats, Array]:
-    """How alike the photographs are, 0 to 1 (N, L), with each place moved along its normal; and the views' cosines.
+    """Return how alike the photographs are, 0 to 1 (N, L), with places moved along normals; and the views' cosines.
 
     It is the correlation of patches, averaged over pairs of views. A noise is added to each variance, so that patches
     without texture correlate little. It is 0 where fewer than two views see a place.
@@ -393,7 +393,7 @@ def evidence(
 
 
 def _axes(points_m: Array, normals: Array, eye_m: Array) -> tuple[Array, Array]:
-    """Unit vectors in the surface: towards the eye, which is foreshortened, and across."""
+    """Return the unit vectors in the surface: towards the eye, which is foreshortened, and across."""
     toward = eye_m - points_m + 1e-9  # never exactly along the normal
     steep = toward - np.einsum("ij,ij->i", toward, normals)[:, None] * normals
     steep /= np.maximum(np.linalg.norm(steep, axis=1, keepdims=True), 1e-12)
@@ -401,7 +401,7 @@ def _axes(points_m: Array, normals: Array, eye_m: Array) -> tuple[Array, Array]:
 
 
 def _likeness(patches: Floats, seen: NDArray[np.bool_]) -> Floats:
-    """(N, L) mean correlation of pairs of patches (N, VIEWS, L, samples)."""
+    """Return (N, L) mean correlation of pairs of patches (N, VIEWS, L, samples)."""
     variance = np.mean(patches**2, axis=-1) + np.float32(_NOISE**2)
     total, count = np.zeros((patches.shape[0], patches.shape[2]), dtype=np.float32), np.zeros(len(patches))
     for i in range(VIEWS):
@@ -414,7 +414,7 @@ def _likeness(patches: Floats, seen: NDArray[np.bool_]) -> Floats:
 
 
 def _patches(photographs: Sequence[Photograph], points_m: Array, axes: Array, chosen: Ints, moves_m: Array) -> Floats:
-    """(N, VIEWS, L, samples) what each view shows of each moved patch, less its mean.
+    """Return (N, VIEWS, L, samples) what each view shows of each moved patch, less its mean.
 
     The patch is projected with the derivative at its middle, since it is small compared with its distance.
     """
@@ -439,7 +439,7 @@ def _patches(photographs: Sequence[Photograph], points_m: Array, axes: Array, ch
 
 
 def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
-    """The image at pixels (...), which cv2.remap takes as rectangles only."""
+    """Return the image at pixels (...), which cv2.remap takes as rectangles only."""
     rows = -(-u.size // _COLUMNS)
     x, y = (np.pad(k.ravel(), (0, rows * _COLUMNS - u.size), mode="edge").reshape(rows, _COLUMNS) for k in (u, v))
     out = np.empty((rows, _COLUMNS), dtype=np.float32)
@@ -462,13 +462,13 @@ _SPRING_ROUNDS = 3  # solutions; each after the first with weaker springs where 
 def relaxed(
     points_m: Array, held: Array, fixed: NDArray[np.bool_], edges: NDArray[np.int64], even_m: float, slip_m: float
 ) -> Array:
-    """(V, 3) vertices for which the energy of springs and bending together is least.
+    """Return (V, 3) vertices for which the energy of springs and bending together is least.
 
     Args:
         points_m: (V, 3) vertices, at which the springs have no force.
         held: (V,) stiffness of the springs, 0 to 1.
         fixed: (V,) vertices that do not move.
-        edges: (E, 2) of neighbours.
+        edges: (E, 2) pairs of neighbours.
         even_m: length over which the plate evens out what springs of stiffness 1 hold.
         slip_m: extension that halves the stiffness of a spring, so that single errors do not hold the plate.
     """
@@ -488,7 +488,7 @@ def relaxed(
 
 
 def _bending(edges: NDArray[np.int64], count: int) -> csr_matrix:
-    """(V, V) takes vertices to what separates each from the mean of its neighbours."""
+    """Return (V, V) takes vertices to what separates each from the mean of its neighbours."""
     beside = neighbours(edges, count)
     mean = diags(1 / np.maximum(np.asarray(beside.sum(axis=1), dtype=np.float64).ravel(), 1)) @ beside
     return (identity(count, format="csr") - mean).tocsr()

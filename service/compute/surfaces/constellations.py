@@ -48,7 +48,7 @@ class ConstellationMatch:
 
 
 def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> ConstellationMatch:
-    """Rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, in any order.
+    """Return the rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, in any order.
 
     Triangles with equal sides propose poses; the pose that brings most spheres within `tolerance_m` wins. Spheres
     missing from either set are reported. Handedness is checked, so that a mirrored copy (an axis negated by a DICOM
@@ -102,7 +102,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 def _words_of_other_scale(a: Array, b: Array, tolerance_m: float) -> str:
-    """In which scale of the one at least five spheres agree, in words; an empty text if in none."""
+    """Describe the scale of the second in which at least five spheres agree; an empty text if there is none."""
     best: Pairs = ()
     for factor in _FACTORS:
         found = _best(a, factor * b, tolerance_m)
@@ -123,7 +123,7 @@ def _count(solutions: list[Pairs]) -> int:
 
 
 def _best(a: Array, b: Array, tolerance: float) -> list[Pairs]:
-    """The largest consistent assignment of at least four, and all different ones of the same size."""
+    """Return the largest consistent assignment of at least four, and all different ones of the same size."""
     found: dict[Pairs, float] = {}
     size = _LEAST
     for ta, tb in _triangles(a, b, tolerance):
@@ -154,7 +154,7 @@ def _assign(a: Array, b_in_a: Array, tolerance: float) -> tuple[Pairs, float]:
 
 
 def _triangles(a: Array, b: Array, tolerance: float) -> list[tuple[list[int], list[int]]]:
-    """Index triples of a and b with three equal sides; triples of a are taken in one order only."""
+    """Return index triples of a and b with three equal sides; triples of a are taken in one order only."""
     da = np.linalg.norm(a[:, None] - a[None], axis=2)
     db = np.linalg.norm(b[:, None] - b[None], axis=2)
     out: list[tuple[list[int], list[int]]] = []
@@ -181,7 +181,7 @@ class MergedParts:
     """The poses of parts in the frame of the first one.
 
     Attributes:
-        T_first_part: (4, 4) of each part, metres; the identity for the first.
+        T_first_part: (4, 4) pose of each part, metres; the identity for the first.
         spheres: number of different spheres.
         shared: number of spheres that two parts or more show.
         residuals_m: distance of every sphere that is shared, in every part, from its mean over the parts.
@@ -238,7 +238,7 @@ def merge_parts(parts_m: Sequence[Array]) -> MergedParts:
 def _next(
     parts_m: Sequence[Array], poses: dict[int, Transform], members: list[dict[int, int]]
 ) -> tuple[int, Transform, tuple[tuple[int, int], ...]]:
-    """The part that shares most spheres with those that are placed: its pose, and the pairs (sphere, own index)."""
+    """Select the part that shares most spheres with those placed: its pose, and the pairs (sphere, own index)."""
     placed = np.array([_mean(sphere, parts_m, poses) for sphere in members])
     found: list[tuple[int, int, Transform, tuple[tuple[int, int], ...]]] = []
     failed: dict[int, ComputeError] = {}
@@ -262,7 +262,7 @@ def _next(
 
 
 def _mean(sphere: dict[int, int], parts_m: Sequence[Array], poses: dict[int, Transform]) -> Array:
-    """Mean position (3,) of a sphere over the parts that show it, in the frame of the first."""
+    """Return the mean position (3,) of a sphere over the parts that show it, in the frame of the first."""
     return np.mean([apply(poses[part], parts_m[part][index]) for part, index in sphere.items()], axis=0)
 
 
@@ -279,7 +279,7 @@ class SphereDifference:
         difference_m: (3,) position in b minus position in a, in frame a.
         sigma_m: standard deviation of the difference along its direction, including the registration's.
         z: Mahalanobis length of the difference.
-        moved: whether the sphere counts as moved.
+        moved: true if the sphere counts as moved.
     """
 
     pair: tuple[int, int]
@@ -294,11 +294,11 @@ class LoopClosure:
     """Comparison of two measurements of one scene.
 
     Attributes:
-        T_a_b: rigid, from the spheres that did not move, weighted by the covariances.
-        spheres: in the order of the match's pairs.
-        chi2_per_dof: of the spheres that did not move; near 1 if the stated uncertainties are right.
-        rms_m: of the differences of the spheres that did not move.
-        sigma_rms_m: predicted rms from the stated uncertainties.
+        T_a_b: rigid transform by the spheres that did not move, weighted by the covariances.
+        spheres: the spheres' differences, in the order of the match's pairs.
+        chi2_per_dof: chi square of the spheres that did not move; near 1 if the given uncertainties are right.
+        rms_m: root mean square difference of the spheres that did not move.
+        sigma_rms_m: predicted rms from the given uncertainties.
         scale: lengths in b over lengths in a, by all spheres: one of two instruments may be calibrated wrongly.
         scale_sigma: its standard deviation.
     """
@@ -378,7 +378,7 @@ def close_loop(
 def _against_others(
     a: Array, b: Array, C: Array, staying: NDArray[np.bool_], i: int, start: Transform
 ) -> tuple[Array, float, float]:
-    """Difference (3,) of sphere i from its prediction by the others, squared Mahalanobis length, and sigma."""
+    """Return the difference (3,) of sphere i from the others' prediction, squared Mahalanobis length, and sigma."""
     others = staying.copy()
     others[i] = False
     T, covariance = _weighted(a[others], b[others], C[others], start)
@@ -392,7 +392,7 @@ def _against_others(
 
 
 def _weighted(a: Array, b: Array, C: Array, start: Transform) -> tuple[Transform, Array]:
-    """Rigid T_a_b by generalised least squares, and its covariance (6, 6) of (t, w) at a's origin, outer frame."""
+    """Fit rigid T_a_b by generalised least squares, with covariance (6, 6) of (t, w) at a's origin, outer frame."""
     W = np.linalg.inv(C)
 
     def equations(T: Transform) -> tuple[Array, Array]:

@@ -24,12 +24,12 @@ def surface(
     *,
     slab_voxels: int = SLAB_VOXELS,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """Triangles where the volume crosses a threshold; denser material is inside.
+    """Compute triangles where the volume crosses a threshold; denser material is inside.
 
     Args:
         volume_hu: (K, J, I) Hounsfield units.
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
-        threshold_hu: for example, the middle between air and plastic.
+        threshold_hu: the threshold, such as the middle between air and plastic.
         slab_voxels: approximate limit of voxels processed at a time.
 
     Returns:
@@ -65,7 +65,7 @@ def surface(
 
 
 def _range(volume_hu: NDArray[np.int16], depth: int) -> tuple[int, int]:
-    """The least and the largest value; of a mapped file, only `depth` slices are in memory at a time."""
+    """Return the least and the largest value; of a mapped file, only `depth` slices are in memory at a time."""
     lows: list[int] = []
     highs: list[int] = []
     for first in range(0, len(volume_hu), depth):
@@ -79,7 +79,7 @@ def _range(volume_hu: NDArray[np.int16], depth: int) -> tuple[int, int]:
 def _slabs(
     volume_hu: NDArray[np.int16], level: float, depth: int
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
-    """Vertices (i, j, k) and faces slab by slab of `depth` slices, and which vertices lie where two slabs meet."""
+    """Return vertices (i, j, k) and faces slab by slab of `depth` slices, and which vertices lie where two meet."""
     found: list[tuple[int, NDArray[np.float32], NDArray[np.int32]]] = []
     seams: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
     last = volume_hu.shape[0] - 1
@@ -131,7 +131,7 @@ _INNER, _SHELL = 0.8, (1.2, 1.5)  # of the radius
 
 
 def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Array, NDArray[np.int32]]:
-    """Triangles around the segmented voxels.
+    """Return the triangles around the segmented voxels.
 
     The surface is where the segmentation, smoothed by a Gaussian of SIGMA_VOXELS, has the value ½. That moves a
     curved surface inwards by σ² H (H: its mean curvature): 0.005 mm for a sphere of 15 mm in voxels of 0.4 mm. What
@@ -171,15 +171,15 @@ def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Arr
 def sphere_contrasts(
     hounsfield: NDArray[np.int16], T_ct_voxel: Transform, centres_m: Array, radius_m: float
 ) -> Array:
-    """(N,) how much denser each sphere is than what is around it, in HU, signed.
+    """Return (N,) how much denser each sphere is than what is around it, in HU, signed.
 
     Spheres of a segmentation that is mirrored, or of another series, are found where there is none in the volume.
 
     Args:
-        hounsfield: (K, J, I).
+        hounsfield: (K, J, I) the volume in HU.
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
-        centres_m: (N, 3) of the spheres in the CT frame.
-        radius_m: of the spheres.
+        centres_m: (N, 3) centres of the spheres in the CT frame.
+        radius_m: radius of the spheres.
     """
     found = np.empty(len(centres_m))
     sides = np.linalg.norm(T_ct_voxel[:3, :3], axis=0)
@@ -200,7 +200,7 @@ def sphere_contrasts(
 
 
 def cut_voxels(ends: NDArray[np.bool_], T_ct_voxel: Transform, centres_m: Array) -> int:
-    """Number of voxels of the object between the spheres that the first and the last slice cut.
+    """Return the number of voxels of the object between the spheres that the first and the last slice cut.
 
     Only what stands between the spheres counts, as seen along the slices' line: in the rectangle of rows and columns
     around their centres. The scanner's table, below it, goes on beyond any series.

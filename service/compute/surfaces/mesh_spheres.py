@@ -42,8 +42,8 @@ class MeshSphere:
     """A sphere of known radius, located in a mesh.
 
     Attributes:
-        centre_m: (3,) in the mesh's frame.
-        covariance: (3, 3) of the centre, m²; allows for errors that neighbouring vertices share.
+        centre_m: (3,) centre in the mesh's frame.
+        covariance: (3, 3) covariance of the centre, m²; allows for errors that neighbouring vertices share.
         rms_m: weighted root mean square distance of the inliers from the surface.
         radius_residual_m: radius of a free sphere fit to the same vertices, minus the known radius.
         radius_sigma_m: standard deviation of `radius_residual_m`.
@@ -166,7 +166,7 @@ def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | Non
 def _fits(
     starts: Array, vertices: Array, faces: IntArray, patches: Surfels, tree: cKDTree, radius: float
 ) -> list[SphereFit]:
-    """The final fit from each coarse centre (K, 3), without those that fail."""
+    """Return the final fit from each coarse centre (K, 3), without those that fail."""
     if len(starts) == 0:
         return []
     points, weight = _surroundings(starts, vertices, faces, radius)
@@ -192,7 +192,7 @@ def _fits(
 
 
 def _surroundings(starts: Array, vertices: Array, faces: IntArray, radius: float) -> tuple[Array, Array]:
-    """Vertices (N, 3) near any of the centres, and the area each represents; one pass for all centres."""
+    """Return the vertices (N, 3) near any of the centres, and the area each represents; one pass for all centres."""
     low, high = starts.min(axis=0) - 2 * radius, starts.max(axis=0) + 2 * radius
     cell = max(0.5 * radius, float(np.max(high - low)) / 300)
     size = np.ceil((high - low) / cell).astype(np.int64) + 1
@@ -244,7 +244,7 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
 
 
 def _cap_deg(fit: SphereFit) -> float:
-    """Opening in degrees of a cap with the same scatter as the inlier surface in its narrow direction."""
+    """Return the opening in degrees of a cap with the same scatter as the inlier surface in its narrow direction."""
     unit, weight = fit.patches.unit, fit.patches.weight / fit.patches.weight.sum()
     middle = weight @ unit
     off = unit - middle
@@ -266,7 +266,7 @@ def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereL
 def _judge(
     fits: list[SphereFit], radius: float, limits: SphereLimits, expected: int | None
 ) -> tuple[list[SphereFit], list[_Candidate], tuple[CentreUncertainty, ...]]:
-    """Accepted fits with their uncertainties, and the near misses, best covered first."""
+    """Return the accepted fits with their uncertainties, and the near misses, best covered first."""
     ranked = sorted(fits, key=lambda f: -f.coverage)
     refused: list[_Candidate] = []
     good: list[SphereFit] = []
@@ -312,8 +312,8 @@ def _apart(a: SphereFit, b: SphereFit, radius: float) -> bool:
 
 
 def _oriented(fits: list[SphereFit], expected: int | None) -> list[SphereFit]:
-    """Spheres without dents: those with the majority's winding, unless only fits of either winding give the expected
-    number."""
+    """Select spheres without dents: those with the majority's winding, unless only fits of either winding give the
+    expected number."""
     outward = [f for f in fits if f.orientation > -_MIXED]
     inward = [f for f in fits if f.orientation < _MIXED]
     for choice in (outward, inward, fits):
@@ -365,7 +365,7 @@ def _at_seeds(
     radius: float,
     limits: SphereLimits,
 ) -> tuple[MeshSphere, ...]:
-    """The sphere at each seed, in the seeds' order."""
+    """Return the sphere at each seed, in the seeds' order."""
     if seeds.ndim != 2 or seeds.shape[1] != 3 or not np.isfinite(seeds).all():
         raise DataError(f"seeds {seeds.shape} are not points (K, 3)", remedy="Give x, y, z of a point at each sphere")
     peaks = vote_peaks(patches, radius)
@@ -421,12 +421,12 @@ def seen_radius(
     *,
     normals: Array | None = None,
 ) -> MeasuredRadius | None:
-    """The radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
+    """Find the radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
 
     Takes as long as a dozen searches. Arguments as for `locate_spheres`; None if there are no such spheres.
 
     Raises:
-        DataError: as `locate_spheres`.
+        DataError: not a mesh, indices out of range, or vertices that are not finite.
     """
     best: tuple[MeshSphere, ...] = ()
     nearest = radius_m
@@ -471,14 +471,14 @@ class WrongUnit:
 
 
 def wrong_unit(vertices_m: Array, faces: NDArray[np.integer], radius_m: float) -> WrongUnit | None:
-    """The mistaken unit with the most spheres of the known radius.
+    """Find the mistaken unit with the most spheres of the known radius.
 
     Only those are tried that give the mesh the size of a scene, so that a mesh of that size takes no time.
 
     Args:
-        vertices_m: (V, 3) as they were read.
-        faces: (F, 3).
-        radius_m: of the spheres.
+        vertices_m: (V, 3) vertices as they were read.
+        faces: (F, 3) indices of vertices.
+        radius_m: radius of the spheres.
 
     Returns:
         the mistake, or None if no other unit shows three spheres.

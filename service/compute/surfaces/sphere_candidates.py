@@ -20,7 +20,7 @@ _APART = 0.4  # of candidates, in radii
 
 
 def candidates(patches: Surfels, tree: cKDTree, radius: float, min_coverage: float) -> Array:
-    """Centres (K, 3) around which the surface is roughly a sphere over at least `min_coverage` of it."""
+    """Return the centres (K, 3) around which the surface is roughly a sphere over at least `min_coverage` of it."""
     found: list[Array] = []
     for centre in rough_centres(patches, tree, vote_peaks(patches, radius), radius, min_coverage):
         if centre is not None and all(np.linalg.norm(centre - c) > 0.05 * radius for c in found):
@@ -29,7 +29,7 @@ def candidates(patches: Surfels, tree: cKDTree, radius: float, min_coverage: flo
 
 
 def vote_peaks(patches: Surfels, radius: float) -> Array:
-    """Candidate centres (K, 3), strongest first; every surfel votes on both of its sides."""
+    """Return the candidate centres (K, 3), strongest first; every surfel votes on both of its sides."""
     votes = np.concatenate([patches.position - radius * patches.normal, patches.position + radius * patches.normal])
     if len(votes) == 0:
         return np.empty((0, 3))
@@ -78,7 +78,7 @@ _SETTLED = 1e-4  # length of the last step, in radii
 _FLANK = 0.12  # in radii beyond the band, where another shape would continue smoothly
 _FLANK_COSINE = 0.88
 _ROUGH_RMS = 0.013  # of the fit, in radii
-_WELL_COVERED = 0.3  # above it, accepted whatever its rms, so that the operator is told why it is refused
+_WELL_COVERED = 0.3  # above it, accepted whatever its rms, so that the operator learns why it is refused
 _MOST_FLANK = 0.6  # area of the flank over that of the inliers
 
 
@@ -97,7 +97,7 @@ class _Fits:
     area: Array  # (S,)
 
     def kept(self, keep: NDArray[np.bool_]) -> _Fits:
-        """Only some of the fits."""
+        """Return only some of the fits."""
         rows = keep[self.owner]
         counts = np.diff([*self.first, len(self.owner)])[keep]
         return _Fits(
@@ -107,7 +107,7 @@ class _Fits:
         )  # fmt: skip
 
     def summed(self, values: Array) -> Array:
-        """(F, ...) sums of values (S, ...) over the surfels of each fit."""
+        """Return (F, ...) sums of values (S, ...) over the surfels of each fit."""
         return np.add.reduceat(values, self.first, axis=0)
 
 
@@ -125,13 +125,13 @@ class _Step:
 def rough_centres(
     patches: Surfels, tree: cKDTree, starts: Array, radius: float, min_coverage: float
 ) -> list[Array | None]:
-    """Known-radius fits to the surfels near places (K, 3): a centre (3,) for each, None if they are not a sphere.
+    """Fit spheres of a known radius to the surfels near places (K, 3): a centre (3,) or None for each.
 
     Args:
         patches: the surface.
-        tree: of the surfels' positions.
-        starts: at or near centres, m.
-        radius: of the spheres, m.
+        tree: tree of the surfels' positions.
+        starts: (K, 3) places at or near centres, m.
+        radius: radius of the spheres, m.
         min_coverage: fraction of the whole sphere that will be required of the final fit.
     """
     found: list[Array | None] = [None] * len(starts)
@@ -183,7 +183,7 @@ def _step(fits: _Fits, radius: float) -> _Step:
 
 
 def _is_sphere(fits: _Fits, step: _Step, radius: float, min_coverage: float) -> NDArray[np.bool_]:
-    """(F,) whether the surface covers enough of the sphere, is round, and ends with it."""
+    """Return (F,) whether the surface covers enough of the sphere, is round, and ends with it."""
     inlier, distance, band = step.weights > 0, np.abs(step.residual), fits.half_width[fits.owner]
     beyond = (distance >= band) & (distance < band + _FLANK * radius) & (step.cosine > _FLANK_COSINE)
     area, flank = fits.summed(np.where(inlier, fits.area, 0.0)), fits.summed(np.where(beyond, fits.area, 0.0))

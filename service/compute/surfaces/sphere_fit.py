@@ -20,13 +20,13 @@ _STEADY = 0.5  # length of the sum of the area vectors over the sum of their len
 
 @dataclass(frozen=True, slots=True)
 class Surfels:
-    """Cells of surface.
+    """Cells of a surface, each reduced to one sample.
 
     Attributes:
         position: (N, 3) centroids.
         normal: (N, 3) unit normals of either sign.
         area: (N,) m².
-        outward: (N, 3) area-weighted mean of the unit normals stated by the data; 0 if there are none.
+        outward: (N, 3) area-weighted mean of the unit normals in the data; 0 if there are none.
     """
 
     position: Array
@@ -94,12 +94,12 @@ def _from_sums(cells: Array, low: Array, cell: float, *, is_mesh: bool) -> Surfe
 
 
 def summed(group: IntArray, columns: list[Array], n: int) -> Array:
-    """Sums (n, len(columns)) of the columns (N,) over the rows of each group (N,)."""
+    """Return the sums (n, len(columns)) of the columns (N,) over the rows of each group (N,)."""
     return np.stack([np.bincount(group, column, n).astype(np.float64) for column in columns], axis=1)
 
 
 def grid_keys(points: Array, low: Array, size: IntArray, cell: float) -> IntArray:
-    """Keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) that begins one cell before `low`."""
+    """Return keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) from one cell before `low`."""
     index = np.floor((points - low) / cell).astype(np.int64) + 1
     return (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
 
@@ -110,12 +110,12 @@ LEAST_SPREAD = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Which samples have a weight in a fit.
+    """The rule by which samples have a weight in a fit.
 
     Attributes:
         half_width: residual beyond which a sample has no weight, m.
-        min_cosine: between normal and radius; below it, a sample is not on the sphere.
-        min_samples: below it, there is no fit.
+        min_cosine: least cosine between normal and radius; below it, a sample is not on the sphere.
+        min_samples: least number of samples; below it, there is no fit.
     """
 
     half_width: float
@@ -130,10 +130,10 @@ class TukeyStep:
     Attributes:
         unit: (N, 3) directions from the centre to the samples.
         residual: (N,) distances from the sphere, m, outward positive.
-        cosine: (N,) between normal and radius, without sign.
-        eligible: (N,) whether a sample lies in the band.
+        cosine: (N,) cosine between normal and radius, without sign.
+        eligible: (N,) true if a sample lies in the band.
         weights: (N,) Tukey's weights times the samples' areas.
-        step: (3,) of the centre, m.
+        step: (3,) step of the centre, m.
     """
 
     unit: Array
@@ -151,7 +151,7 @@ class OrientedPoints:
     Attributes:
         points: (N, 3), m.
         normals: (N, 3) unit, of either sign.
-        area: (N,) that each sample represents.
+        area: (N,) area that each sample represents.
     """
 
     points: Array
@@ -169,7 +169,7 @@ class CentreFit:
 
 
 def tukey_weights(residual: Array, half_width: float | Array) -> Array:
-    """Tukey's weights (N,) of residuals (N,) that lie in a band of this half-width (N,)."""
+    """Return Tukey's weights (N,) of residuals (N,) that lie in a band of this half-width (N,)."""
     return (1 - (residual / half_width) ** 2) ** 2
 
 
@@ -183,15 +183,15 @@ def fit_centre(
     reach: float,
     most: int,
 ) -> CentreFit | None:
-    """The centre of a sphere; None if its surface is not there, or the centre moves beyond `reach`.
+    """Fit the centre of a sphere; None if its surface is not there, or the centre moves beyond `reach`.
 
     It is a reweighted fit, not least squares of a fixed cost: the band shrinks with the residuals until both settle.
 
     Args:
         surface: samples near the sphere.
         start: (3,) initial centre, m.
-        radius: of the sphere, m.
-        band: which samples count at first.
+        radius: radius of the sphere, m.
+        band: rule that selects the samples at first.
         narrowed: the next half-width after a step, from the step and the present half-width; None: it has settled.
         reach: largest distance of the centre from the start, m.
         most: largest number of steps.
@@ -212,7 +212,7 @@ def fit_centre(
 
 
 def _step(surface: OrientedPoints, centre: Array, radius: float, band: Band) -> TukeyStep | None:
-    """Weighted Gauss–Newton step of the centre; None if too few samples lie in the band, or in too flat a cap."""
+    """Take a weighted Gauss–Newton step of the centre; None if too few samples lie in the band, or too flat a cap."""
     ray = surface.points - centre
     distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
     unit = ray / np.maximum(distance, 1e-300)[:, None]
@@ -246,9 +246,9 @@ class SphereSamples:
     a cap's centre by as much, while its vertices lie on the sphere.
 
     Attributes:
-        points: (N, 3).
+        points: (N, 3) the places, m.
         normals: (N, 3) unit, of either sign, averaged over the neighbourhood.
-        outward: (N, 3) normals stated by the data (0 if none), averaged over the neighbourhood.
+        outward: (N, 3) normals in the data (0 if none), averaged over the neighbourhood.
         weight: (N,) area that each point represents; relative for points without faces.
     """
 
@@ -278,15 +278,15 @@ class Patches:
 
 @dataclass(frozen=True, slots=True)
 class SphereFit:
-    """A finished fit.
+    """A finished fit of a sphere to a surface.
 
     Attributes:
         centre: (3,), m.
         rms: weighted root mean square distance of the inliers, m.
         radius_residual: radius of a free fit minus the known one, m; NaN if the inliers do not determine it.
         coverage: solid angle of the inliers, as a fraction of the whole sphere.
-        orientation: 1 if the stated normals point away from the centre, -1 if towards it, 0 if they disagree or there
-            are none.
+        orientation: 1 if the normals in the data point away from the centre, -1 if towards it, 0 if they disagree or
+            there are none.
         flank: area of the surface that continues smoothly beyond the inliers, over their area: a sphere's surface
             ends or meets something at an angle.
         form: rms of the averaged residuals from a free sphere, m: deviation from a sphere's shape.
@@ -306,7 +306,7 @@ class SphereFit:
 
 
 def fit_sphere(samples: SphereSamples, start: Array, radius: float, band: float) -> SphereFit | None:
-    """Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
+    """Fit a sphere of known radius (Tukey) from a centre that is good to `band`; None if too few inliers remain."""
     points, area = samples.points, samples.weight
 
     def narrowed(at: TukeyStep, half_width: float) -> float | None:
@@ -345,8 +345,8 @@ def fit_sphere(samples: SphereSamples, start: Array, radius: float, band: float)
 
 
 def _tukey_gain(residual: Array, band: float, area: Array) -> float:
-    """Attenuation of weighted mean residuals: a shift of the surface moves the mean by the sum of the influence
-    function's slopes, not by that of the weights."""
+    """Return the attenuation of weighted mean residuals: a shift of the surface moves the mean by the sum of the
+    influence function's slopes, not by that of the weights."""
     inside = (np.abs(residual) < band) & (area > 0)
     x2 = (residual[inside] / band) ** 2
     weights = float(np.sum(area[inside] * (1 - x2) ** 2))
@@ -392,8 +392,8 @@ def _patches(u: Array, r: Array, w: Array) -> Patches:
 
 
 def coverage(u: Array) -> float:
-    """Fraction of the whole sphere covered by directions (N, 3): counted in cells of a cube's faces, so that neither
-    uneven density nor a duplicate shell matters."""
+    """Return the fraction of the whole sphere covered by directions (N, 3): counted in cells of a cube's faces, so
+    that neither uneven density nor a duplicate shell matters."""
     n = int(np.clip(np.sqrt(len(u) / 24), 2, 20))
     axis = np.abs(u).argmax(axis=1)
     rows = np.arange(len(u))
@@ -409,7 +409,7 @@ def coverage(u: Array) -> float:
 
 
 def sample_weights(points: Array, cell: float) -> Array:
-    """Weights (N,) of points without faces: a cell of surface counts once, however many points are in it."""
+    """Weigh (N,) points without faces: a cell of surface counts once, however many points are in it."""
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     key = (index[:, 0] * (1 << 20) + index[:, 1]) * (1 << 20) + index[:, 2]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)

@@ -38,8 +38,8 @@ class CentreUncertainty:
     """Uncertainty of a sphere fit.
 
     Attributes:
-        covariance: (3, 3) of the centre, m².
-        radius_sigma: of the free radius, m.
+        covariance: (3, 3) covariance of the centre, m².
+        radius_sigma: standard deviation of the free radius, m.
     """
 
     covariance: Array
@@ -47,7 +47,7 @@ class CentreUncertainty:
 
 
 def estimate_noise(spheres: Sequence[Patches]) -> NoiseModel:
-    """Restricted maximum likelihood over a grid of lengths and ratios, from the residuals of all spheres together.
+    """Estimate noise by restricted maximum likelihood over a grid of lengths and ratios, from all spheres' residuals.
 
     Centre and radius of each sphere are projected out first, so that the part absorbed by the fit is accounted for.
 
@@ -96,7 +96,7 @@ def _correlation(unit: Array, length: float) -> Array:
 
 
 def _spectrum(p: Patches, K: Array, length: float) -> tuple[Array, Array]:
-    """Eigenvalues of the correlated part relative to the white part among the contrasts, and the residuals there."""
+    """Return eigenvalues of the correlated relative to the white part among the contrasts, and residuals there."""
     white = K.T @ (K * p.white[:, None])
     shared = K.T @ (_correlation(p.unit, length) * float(np.mean(p.white))) @ K
     values, vectors = eigh(shared, white, check_finite=False)
@@ -106,8 +106,8 @@ def _spectrum(p: Patches, K: Array, length: float) -> tuple[Array, Array]:
 def centre_uncertainties(
     spheres: Sequence[Patches], radius_residuals: Sequence[float], radius: float
 ) -> tuple[CentreUncertainty, ...]:
-    """Covariances of the weighted known-radius fits; if the free radii deviate by more than noise explains, the
-    effect on the centres is added."""
+    """Compute covariances of the weighted known-radius fits; if the free radii deviate by more than noise explains,
+    the effect on the centres is added."""
     noise = estimate_noise(spheres)
     parts: list[tuple[Array, Array, float]] = []
     for p, scale in zip(spheres, noise.scale, strict=True):

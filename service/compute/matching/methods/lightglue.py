@@ -36,7 +36,7 @@ class LightGlue:
         return Matches(first_px, second_px, confidence[rows])
 
     def _data(self, features: SiftFeatures, picture: Picture) -> Mapping[str, object]:
-        """What LightGlue reads of an image: lengths in pixels, angles in radians, descriptors of length 1."""
+        """Return LightGlue's inputs for an image: lengths in pixels, angles in radians, descriptors of length 1."""
         descriptors = features.descriptors.astype(np.float32)
         descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), np.float32(1e-6))
         arrays = {
@@ -51,7 +51,7 @@ class LightGlue:
 
 
 def strongest(features: SiftFeatures) -> SiftFeatures:
-    """The MOST_FEATURES features with the largest scales, in their order."""
+    """Return the MOST_FEATURES features with the largest scales, in their order."""
     kept = np.sort(np.argsort(-features.scales_px, kind="stable")[:MOST_FEATURES])
     return SiftFeatures(
         features.points[kept], features.scales_px[kept], features.orientations_rad[kept], features.descriptors[kept]
@@ -59,7 +59,7 @@ def strongest(features: SiftFeatures) -> SiftFeatures:
 
 
 def present_names(weights: Weights) -> Weights:
-    """The weights by the names that the network has today; the published file has older ones."""
+    """Return the weights by the names that the network has today; the published file has older ones."""
     renamed: dict[str, str] = {name: name for name in weights}
     for layer in range(_LAYERS):
         for block in ("self_attn", "cross_attn"):

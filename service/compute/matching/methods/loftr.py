@@ -47,14 +47,14 @@ class LoFTR:
 
 
 def reduced_size(picture: Picture) -> tuple[int, int]:
-    """Width and height at which the network sees a picture."""
+    """Return the width and height at which the network sees a picture."""
     height, width = picture.shape[:2]
     factor = min(1.0, LONGER_SIDE_PX / max(height, width))
     return max(1, round(factor * width / _CELL)) * _CELL, max(1, round(factor * height / _CELL)) * _CELL
 
 
 def original_px(points: Array, size: tuple[int, int], picture: Picture) -> Array:
-    """Our pixels (M, 2) of the network's points (M, 2), whose first pixel has its centre at 0.5."""
+    """Return our pixels (M, 2) of the network's points (M, 2), whose first pixel has its centre at 0.5."""
     height, width = picture.shape[:2]
     return points * (np.array([width, height]) / np.array(size)) - 0.5
 

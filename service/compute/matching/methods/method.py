@@ -36,14 +36,14 @@ class Match(Interface):
 
 @dataclass(frozen=True, slots=True)
 class Matcher:
-    """A method.
+    """A matching method.
 
     Attributes:
-        name: as it is named on the command line.
-        words: what it is called in the table.
+        name: its name on the command line.
+        words: its label in the table.
         load: makes it ready, with its weights if it has any. Raises ConfigurationError, which says what to install,
             if something is missing, and DataError if the weights are not its own.
-        weights: the file of its weights, in words; "" if it has none.
+        weights: description of its file of weights; "" if it has none.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Matcher:
 
 
 def matchers() -> dict[str, Matcher]:
-    """Every method by its name.
+    """Return every method by its name.
 
     Raises:
         ConfigurationError: two have the same name, or an entry point names something else.
@@ -62,7 +62,7 @@ def matchers() -> dict[str, Matcher]:
 
 
 def matcher(name: str) -> Matcher:
-    """The method of this name.
+    """Return the method of this name.
 
     Raises:
         ConfigurationError: there is none.

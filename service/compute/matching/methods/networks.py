@@ -25,7 +25,7 @@ class Tensor(Interface):
     """The part of torch.Tensor that is used here."""
 
     def numpy(self) -> NDArray[np.generic]:
-        """Its values."""
+        """Return its values."""
         ...
 
 
@@ -33,7 +33,7 @@ Weights = Mapping[str, Tensor]
 
 
 class LoadReport(Interface):
-    """What became of the weights."""
+    """The result of loading weights."""
 
     @property
     def missing_keys(self) -> list[str]:
@@ -49,7 +49,7 @@ class Network(Interface):
         ...
 
     def named_parameters(self) -> Iterable[tuple[str, object]]:
-        """Names and values of the learned parameters."""
+        """Return the names and values of the learned parameters."""
         ...
 
     def eval(self) -> object:
@@ -72,7 +72,7 @@ class Torch:
 
 
 def torch_with(network: str, words: str) -> Torch:
-    """PyTorch, with the class of kornia.feature of this name.
+    """Return PyTorch, with the class of kornia.feature of this name.
 
     Raises:
         ConfigurationError: one of both is not installed.
@@ -87,7 +87,7 @@ def torch_with(network: str, words: str) -> Torch:
 
 
 def read_weights(torch: Torch, path: Path | None, expected: str) -> Weights:
-    """The weights in a local file; nothing is downloaded, and no code in the file is run.
+    """Read the weights in a local file; nothing is downloaded, and no code in the file is run.
 
     Raises:
         ConfigurationError: no file is named.
@@ -129,7 +129,7 @@ def _foreign(path: Path | None, expected: str) -> DataError:
 
 
 def grey_0_to_1(picture: Picture, size: tuple[int, int]) -> Floats:
-    """(1, 1, h, w) grey values from 0 to 1, resized to a width and height."""
+    """Return (1, 1, h, w) grey values from 0 to 1, resized to a width and height."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     small = cv2.resize(np.asarray(grey, dtype=np.uint8), size, interpolation=cv2.INTER_AREA)
     return (np.asarray(small, dtype=np.float32) / np.float32(255.0))[None, None]

@@ -18,13 +18,13 @@ FIRST_OCTAVE = -1  # COLMAP's default: the image is doubled first
 
 
 class ExtractedSift:
-    """Features of pictures, kept for the pairs that follow."""
+    """Features of pictures, cached for the pairs that follow."""
 
     def __init__(self) -> None:
         self._known: dict[bytes, SiftFeatures] = {}
 
     def of(self, picture: Picture) -> SiftFeatures:
-        """The features of a picture, extracted once."""
+        """Return the features of a picture, extracted once."""
         key = hashlib.blake2b(picture.tobytes()).digest()
         if key not in self._known:
             grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
