@@ -46,7 +46,7 @@ class ChildState:
 
     @property
     def pending(self) -> bool:
-        """Whether it is still running."""
+        """True while the child is still running."""
         return not self.problem and self.result is None
 
 
@@ -81,8 +81,8 @@ class ChildProcesses:
 
         Args:
             run_id: the run.
-            arguments: of the module's command line.
-            by: who asked for it.
+            arguments: the arguments of the module's command line.
+            by: the account of the person who asked for it.
             keep: called with the result before it is shown; may raise OSError or ValueError.
             tidy: called when the child has ended, however that was: one that is killed removes nothing itself.
         """
@@ -165,7 +165,7 @@ class ChildProcesses:
 
 
 def ends_tidily_when_stopped() -> None:
-    """In a child process, turn SIGTERM into an exception, so that unfinished files are removed on the way out."""
+    """Turn SIGTERM into an exception in a child process, so that unfinished files are removed on the way out."""
     signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit(STOPPED))
 
 

@@ -78,7 +78,7 @@ class Graph:
 
 
 def graphs(store: Store) -> IncrementalResults[Graph]:
-    """Graphs of a data folder's runs, kept up to date in the background."""
+    """Graphs of a data folder's runs, updated in the background."""
     return IncrementalResults(store, lambda run_id, before: _step(store, run_id, before), "provenance")
 
 
@@ -195,7 +195,7 @@ def _connect(graph: Graph, source: str, target: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a file came from and what was made from it."""
+    """The origin of a file, and what was made from it."""
 
     records: Sequence[ArtefactRow]  # the first says where it came from
     event: EventRow  # that brought it
@@ -211,7 +211,7 @@ LISTED = 50
 
 
 def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
-    """What a file came from and what was made from it. Raises UnknownRunError if the run has no such file."""
+    """Find what a file came from and what was made from it. Raises UnknownRunError if the run has no such file."""
     records = one_artefact(connection, run_id, sha256)
     (event,) = read_rows(connection, run_id, [records[0].seq], whole=True)
     job = _job_of(connection, run_id, event)
@@ -291,7 +291,7 @@ def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]
 def _decoded_from(
     connection: Connection, run_id: str, event: EventRow, row: ArtefactRow
 ) -> tuple[list[ArtefactRow], int]:
-    """The originals of a file that a driver decoded: those kept before it in the same step from the same device."""
+    """Find the originals of a file that a driver decoded: those stored before it in the same step from its device."""
     kept = event.record(FilesKept)
     if kept is None or kept.note.startswith(_KEPT_AS_IT_CAME):
         return [], 0

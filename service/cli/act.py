@@ -101,7 +101,7 @@ def act_command(
 def _identity(
     store: Store, protocol: Protocol, state: RunState, verb: str, name: str, password: Callable[[], str]
 ) -> Identity:
-    """Who acts. Pausing is always safe, so anybody may pause without a password."""
+    """Identify the person who acts. Pausing is always safe, so anybody may pause without a password."""
     identity = identity_for(People(store), protocol, state, verb, name, password)
     if identity is None and verb == "pause":
         return who_pauses(People(store), name)

@@ -85,7 +85,7 @@ class HandEyeFile(HandEye):
         left_out: reason, by file of the folder that was not searched.
         images_without_board: reason, by image in which the board was not found.
         suggested_poses: further poses, the most useful first.
-        suggestions_reachable: whether it was checked that the arm reaches them.
+        suggestions_reachable: true if it was checked that the arm reaches them.
     """
 
     left_out: dict[str, str]
@@ -307,7 +307,7 @@ def _require_possible(setup: Setup, joints: Path | None, arm: str | None, previe
 
 
 class _Reachable:
-    """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
+    """A check whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
     def __init__(self, arm: ArmModel, joints_rad: Array, session: _BoardSession) -> None:
         self._arm, self._joints, self._poses = arm, joints_rad, session.T_base_flange

@@ -92,7 +92,7 @@ def print_document(text: str) -> None:
 
 
 def exit_status(error: OrthocaptureError) -> int:
-    """With which status a command ends that met this error."""
+    """Return the exit status of a command that ends with this error."""
     return WAITS_FOR_A_PERSON if isinstance(error, PersonNeededError) else 1
 
 
@@ -119,7 +119,7 @@ def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
 def reporting_errors(json: bool = False) -> Generator[None]:
     """Wrap a command's body: an OrthocaptureError is printed and ends it with its status; others are bugs and pass.
 
-    With `json` a bug is printed as JSON too, so that the program that reads it is told.
+    With `json` a bug is printed as JSON too, so that the program that reads it learns of it.
     """
     try:
         yield

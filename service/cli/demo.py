@@ -258,7 +258,7 @@ def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> _S
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """What the demonstration made, and how long it took."""
+    """The results of the demonstration, and how long it took."""
 
     run: str
     data_dir: str

@@ -156,7 +156,7 @@ def import_command(
 
 
 def _parts_of(protocol: Protocol) -> set[PhotographRole | FileRole]:
-    """What the steps of a protocol import."""
+    """Return which photographs and files the steps of a protocol import."""
     parts: set[PhotographRole | FileRole] = set()
     for step in protocol.step_ids:
         part = part_of(protocol, step)
@@ -221,7 +221,7 @@ def listing_record(listing: ImportList) -> dict[str, object]:
 
 
 def _unread(listing: ImportList) -> dict[str, str]:
-    """What could not be read of photographs that are imported all the same, by file."""
+    """Return by file what could not be read of photographs that are imported all the same."""
     return {v.photograph.path: str(v.camera["unread"]) for v in listing.views if "unread" in v.camera}
 
 

@@ -254,7 +254,7 @@ def _mount(tree: FrameTree, flange: str, camera_frame: str) -> Transform:
 
 
 def _how_found(taken: _Images, poses: dict[str, FoundPose]) -> dict[str, dict[str, int | bool]]:
-    """Of each image with a pose its stamp, and how the pose was found."""
+    """Return the stamp of each image with a pose, in ns, and how the pose was found."""
     return {
         name: {"stamp_ns": taken.stamps_ns[name], "away_ns": one.away_ns, "interpolated": one.interpolated}
         for name, one in poses.items()

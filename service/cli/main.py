@@ -23,7 +23,7 @@ from service.logs.terminal import show_own_words_only
 
 @dataclass(frozen=True, slots=True)
 class _Command:
-    """Where a command is, and its line in the list of commands: the first paragraph of its own help."""
+    """The place of a command, and its line in the list of commands: the first paragraph of its own help."""
 
     place: str
     line: str

@@ -151,7 +151,7 @@ class _Operator:
         self.display.tell(message)
 
     def busy(self, what: str) -> None:
-        """Tell the screens what a long call is doing."""
+        """Report to the screens what a long call is doing."""
         self.display.reporter.busy(what)
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
@@ -161,7 +161,7 @@ class _Operator:
         self.display.reporter.attend(doing, state.current, attempt, pedal_armed=pedal_armed, asks=asks, words=words)
 
     def stuck(self, why: str, for_s: float) -> None:
-        """Let the person who was told put it right, however long that takes."""
+        """Let the person who was asked put it right, however long that takes."""
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
         """The items that a confirmation ticks: the whole list, as the terminal says."""

@@ -51,7 +51,7 @@ RemarksOption = Annotated[str, typer.Option("--remarks", help="Anything else for
 
 
 def described(specimen: str, *, purpose: str, site: str, remarks: str) -> RunAbout:
-    """What a person enters about a run; in a terminal a specimen that is not given is asked for.
+    """Return what a person enters about a run; ask for the specimen in a terminal if it is not given.
 
     Raises ConfigurationError if it is not named, or a text is too long.
     """

@@ -382,7 +382,7 @@ def open_devices(station: Station) -> OpenDevices:
 
 
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
-    """What a capture step will do, in words, for the person who is asked to confirm it."""
+    """Describe what a capture step will do for the person who is asked to confirm it."""
     # Planning takes half a second to load, which a run that is answered on the screen does without.
     from service.steps.plan_preview import preview_board_poses, preview_plans  # noqa: PLC0415
 

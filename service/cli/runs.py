@@ -65,7 +65,7 @@ def runs_command(
 
 
 def by(run: FoundRun) -> str:
-    """Who worked at the rig, or, if not stated, who began the run."""
+    """Return who worked at the rig or, if that was not given, who started the run."""
     return run.about.operator or run.begun_by
 
 

@@ -1,4 +1,4 @@
-"""Tells what the record of a run says about its data set, for its card and for dataset.json."""
+"""Reads what the record of a run says about its data set, for its card and for dataset.json."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def about_run(
     version: str = FIRST_VERSION,
     personal: bool = True,
 ) -> About:
-    """What a run's data set says about itself.
+    """Return what a run's data set says about itself.
 
     Args:
         summary: the run.
-        own: name of its registration.
-        not_in_yet: results that have not arrived yet, in words.
+        own: the name of its registration.
+        not_in_yet: texts on results that have not arrived yet.
         stated: replaces what the protocol states.
-        version: of the data set.
+        version: the data set's version.
         personal: False leaves people and serial numbers out.
     """
     root, entered = summary.root, summary.root.about
@@ -162,7 +162,7 @@ def _settings(summary: RunSummary) -> tuple[tuple[str, str], ...]:
 def described_run(
     summary: RunSummary, own: str, not_in_yet: Sequence[str], *, personal: bool = True
 ) -> dict[str, Any]:
-    """What `dataset.json` says of the run, as plain data; `own` is the name of its registration."""
+    """Return what `dataset.json` says of the run as plain data; `own` is the name of its registration."""
     later = summary.better_later()
     return {
         "run": summary.run_id,

@@ -62,7 +62,7 @@ def software(version: str) -> Entity:
 
 
 def person(account: str, full_names: Mapping[str, str]) -> Entity:
-    """By full name; the account, as the records have it, is the other name."""
+    """Return a person's entity: the full name, and as the other name the account, as the records have it."""
     found = {"@id": anchor("person", account), "@type": "Person", "name": full_names.get(account) or account}
     return found if found["name"] == account else found | {"alternateName": account}
 
@@ -84,13 +84,13 @@ def anchor(kind: str, name: str) -> str:
 
 
 def crate(dataset: DataSet, words: str, files: Sequence[ListedFile], described: Mapping[str, str]) -> dict[str, Any]:
-    """The metadata as plain data.
+    """Return the metadata as plain data.
 
     Args:
-        dataset: as it is written.
+        dataset: the data set as it is written.
         words: the format in a few words.
-        files: of the folder, without this one.
-        described: what a file is, by its name.
+        files: the files of the folder, without this one.
+        described: a description of each file, by its name.
     """
     about = dataset.about
     people = [person(name, {}) for name in about.people]
@@ -165,7 +165,7 @@ def _run(about: About, devices: Sequence[Entity]) -> Entity:
 
 
 def _licence(about: About) -> Entity:
-    """By its address, as RO-Crate wants it; in words where it has none."""
+    """Return the licence's entity: its address, as RO-Crate wants it, or its text if it has none."""
     address = about.licence_address
     if not address:
         return {"@id": "#licence", "@type": "CreativeWork", "name": "Licence", "description": about.licence}

@@ -107,14 +107,14 @@ _TYPES = {
 def croissant(
     dataset: DataSet, words: str, files: Sequence[ListedFile], parts: Parts, described: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The metadata as plain data.
+    """Return the metadata as plain data.
 
     Args:
-        dataset: as it is written.
+        dataset: the data set as it is written.
         words: the format in a few words.
-        files: of the folder, without this one.
+        files: the files of the folder, without this one.
         parts: the files of the views: role → view → file.
-        described: what a file is, by its name.
+        described: a description of each file, by its name.
     """
     about = dataset.about
     marked = "SIMULATED " if dataset.simulated else ""

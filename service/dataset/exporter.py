@@ -23,8 +23,8 @@ class Exporter:
     """A format.
 
     Attributes:
-        name: as it is named on the command line.
-        words: what it is, and who reads it.
+        name: the format's name on the command line.
+        words: a few words on the format and who reads it.
         write: puts the files of a data set into a folder; units and frames are stated in its docstring.
         pinhole: the format has no distortion, so it gets undistorted images.
         one_camera: the format has one camera, so it gets only the images of the rig's first one.
@@ -67,7 +67,7 @@ def write_data_set(
     """Write a data set into a new folder, with what every folder has beside the format.
 
     Args:
-        dataset: as photographed; it is undistorted here where the format needs that.
+        dataset: the data set as photographed; it is undistorted here where the format needs that.
         how: the format.
         target: a new folder; it appears when it is whole.
         personal: False leaves GPS, owner and serial numbers out of resampled pictures.
@@ -106,13 +106,13 @@ _DESCRIBED = {
 
 
 def write_package(dataset: DataSet, folder: ExportFolder, *, form: str, words: str, description: str) -> None:
-    """dataset.json, splits.json, views.csv, the data card, Croissant and RO-Crate; the format's files come before.
+    """Write dataset.json, splits.json, views.csv, data card, Croissant and RO-Crate, after the format's files.
 
     They are written again when an interrupted export goes on, because they depend on the whole record.
 
     Args:
-        dataset: as the format got it.
-        folder: with the files of the format.
+        dataset: the data set as the format got it.
+        folder: the folder with the files of the format.
         form: the format's name.
         words: the format in a few words.
         description: the docstring of its writer, which explains its files.

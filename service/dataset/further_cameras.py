@@ -25,13 +25,13 @@ class KnownFurtherCamera:
     """A further camera of a run.
 
     Attributes:
-        name: in rig.yaml.
+        name: the camera's name in rig.yaml.
         mounted: fixed in the room, or rigid beside the first camera.
         optics: body, lens and settings as its first photograph states them.
         calibration: file with its intrinsics.
-        images: by viewpoint, its photograph of each valid view.
+        images: its photograph of each valid view, by viewpoint.
         located: its pose, as the registration step found it; None before that.
-        clock: how far its clock is ahead of the first camera's; None if the photographs do not tell.
+        clock: how far its clock is ahead of the first camera's; None if the photographs do not show it.
     """
 
     name: str

@@ -32,7 +32,7 @@ class _Last(Generic[_T]):
         self._kept: tuple[str, _T] | None = None
 
     def of(self, view: PosedView) -> _T:
-        """What belongs to a view; not to be written to."""
+        """Return what was made for a view; it must not be written to."""
         if self._kept is None or self._kept[0] != view.name:
             self._kept = None  # the memory of the last one is free while the next is made
             self._kept = (view.name, self._make(view))
@@ -234,7 +234,7 @@ def cropped_data_set(
 
 
 def _encoded(view: PosedView, colours: NDArray[np.uint8], original: bytes, personal: bool) -> bytes:
-    """As PNG, or as JPEG of quality 97 without subsampled colours, with the original's metadata."""
+    """Encode as PNG, or as JPEG of quality 97 without subsampled colours, with the original's metadata."""
     encoded, data = cv2.imencode(view.suffix, colours, _JPEG if view.suffix == ".jpg" else ())
     if not encoded:
         raise DataError("the picture cannot be encoded", where=view.name, remedy="Export originals instead")

@@ -1,4 +1,4 @@
-"""The posts of a run's registration spheres, which are not recorded: the scan's board or an arm tells their place."""
+"""The posts of a run's registration spheres, which are not recorded: the scan's board or an arm shows their place."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _LEAST_LEVEL = 0.05  # share of the surface that must be level
 
 @dataclass(frozen=True, slots=True)
 class Posts:
-    """The posts.
+    """The posts of the spheres.
 
     Attributes:
-        cylinders: each as thick as its sphere.
-        words: what is known of them, to follow the number of spheres.
+        cylinders: one for each post, as thick as its sphere.
+        words: a text on what is known of them, to follow the number of spheres.
     """
 
     cylinders: tuple[Cylinder, ...]
@@ -36,7 +36,7 @@ class Posts:
 
 @dataclass(frozen=True, slots=True)
 class _Ground:
-    """What the posts stand on: its unit normal (3,) upwards, and its height along that, in the frame of the scan."""
+    """The plane on which the posts stand: unit normal (3,) upwards, and height along it, in the frame of the scan."""
 
     up: Array
     height_m: float

@@ -134,14 +134,14 @@ def crop_size(dataset: DataSet, wanted: Callable[[PosedView], Mask]) -> tuple[in
 def small_pictures(
     folder: Path, shown: ViewPreview, view: PosedView, pixels: Pixels, crops: Sequence[ImageCrop]
 ) -> tuple[ViewPreview, SmallDepth]:
-    """Write the pictures of a view. Returns the view with what they tell, and its depth.
+    """Write the pictures of a view. Returns the view with what they show, and its depth.
 
     Args:
-        folder: of the preview.
+        folder: the preview's folder.
         shown: the view, whose files are to be written.
         view: the same in the data set.
-        pixels: of the data set.
-        crops: of the view.
+        pixels: the pixels of the data set.
+        crops: the crops of the view.
 
     Raises:
         DataError: the photograph cannot be read.

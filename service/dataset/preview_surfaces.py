@@ -67,11 +67,11 @@ def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_
 
 
 def vertex_figures(path: Path, points_m: Array) -> tuple[VertexFigures, float]:
-    """Source and sigma at points (V, 3) of the mesh, each that of the nearest vertex; and a high sigma, in mm.
+    """Return source and sigma at points (V, 3) of the mesh, those of the nearest vertices, and a high sigma, mm.
 
     Args:
-        path: of the recorded mesh, a PLY in millimetres with `source` and `sigma_mm` at each vertex.
-        points_m: of a simplified mesh in the same frame.
+        path: file of the recorded mesh, a PLY in millimetres with `source` and `sigma_mm` at each vertex.
+        points_m: (V, 3) points of a simplified mesh in the same frame.
 
     Raises:
         DataError: it has no such properties.
@@ -108,7 +108,7 @@ class SimplifiedMesh:
 
     @classmethod
     def of(cls, mesh: Mesh) -> SimplifiedMesh:
-        """About as many triangles as a browser draws smoothly."""
+        """Simplify a mesh to about as many triangles as a browser draws smoothly."""
         return cls(*decimated(mesh.vertices_m, mesh.faces))
 
 
@@ -232,7 +232,7 @@ def _scene(summary: RunSummary, mesh: SimplifiedMesh, colours: MeshColours, pose
 
 
 def _up(summary: RunSummary) -> tuple[float, float, float] | None:
-    """From the spheres to the cameras of the run's own registration; the axes of a scan point anywhere."""
+    """Return the way from the spheres to the cameras of the run's own registration; a scan's axes point anywhere."""
     own = summary.best()
     if own is None:
         return None

@@ -38,31 +38,31 @@ class About:
 
     Attributes:
         stated: title, licence, ethics, creators and citation, from the protocol or the export's options.
-        version: of the data set.
-        run: identifier of the run.
-        protocol: its id, version and SHA-256.
-        protocol_title: in words.
-        source: where the procedure comes from.
-        specimen: as entered at the start of the run.
-        purpose: likewise.
-        site: likewise.
+        version: the data set's version.
+        run: the run's identifier.
+        protocol: the protocol's id, version and SHA-256.
+        protocol_title: the protocol's title.
+        source: the origin of the procedure.
+        specimen: the specimen, as entered at the start of the run.
+        purpose: the purpose, likewise.
+        site: the site, likewise.
         origin: how the photographs came into the run, a sentence.
         published_utc: time of the last event that the data set rests on.
         head_sha256: hash of that event.
         software: version of this program.
-        people: who took part; empty if personal data are left out.
-        devices: that were opened.
-        settings: of the camera and of the spheres, (name, value) in words.
+        people: accounts of those who took part; empty if personal data are left out.
+        devices: the devices that were opened.
+        settings: settings of the camera and of the spheres, (name, value) as text.
         accuracy: the run's own registration in the evaluation's table; None if there is none.
-        budget: of its error.
-        covariance: what the covariances of the poses hold, a sentence.
-        mesh: what the ground-truth mesh is, a sentence.
-        masks: what the masks hold.
-        fusion: how CT and scan agree and were fused, (name, value) in words; empty if the mesh is the scan.
-        gates: verdicts in words, by step.
-        accepted: gates accepted outside their limits, in words.
-        deviations: from the protocol, in words.
-        later: results that arrived after the evaluation, in words.
+        budget: the budget of its error.
+        covariance: a sentence on what the covariances of the poses hold.
+        mesh: a sentence on what the ground-truth mesh is.
+        masks: a text on what the masks hold.
+        fusion: how CT and scan agree and were fused, (name, value) as text; empty if the mesh is the scan.
+        gates: verdicts as text, by step.
+        accepted: gates accepted outside their limits, as text.
+        deviations: deviations from the protocol, as text.
+        later: results that arrived after the evaluation, as text.
         not_in_yet: results that had not arrived.
     """
 
@@ -120,18 +120,18 @@ class About:
 
     @property
     def creators(self) -> tuple[Party, ...]:
-        """Who made the data set: as stated, else the site."""
+        """The makers of the data set: those given, else the site."""
         site = (Party(self.site, "Organization"),) if self.site else ()
         return tuple(_party(name) for name in self.stated.creators) or site
 
     @property
     def publisher(self) -> Party | None:
-        """Who publishes it, if that was stated."""
+        """The publisher of the data set, if one was given."""
         return _party(self.stated.publisher, "Organization") if self.stated.publisher else None
 
     @property
     def funders(self) -> tuple[Party, ...]:
-        """Who paid for it."""
+        """The funders of the data set."""
         return tuple(_party(name, "Organization") for name in self.stated.funders)
 
     @property
@@ -170,9 +170,9 @@ class PosedView:
     """One image.
 
     Attributes:
-        name: without suffix; unique, of letters, digits, `_`, `-` and `.`.
-        suffix: of its picture file, `.jpg` or `.png`.
-        camera: at the size of the picture; pixel centres at integer coordinates.
+        name: the view's unique name without suffix, of letters, digits, `_`, `-` and `.`.
+        suffix: suffix of its picture file, `.jpg` or `.png`.
+        camera: the camera at the size of the picture; pixel centres are at integer coordinates.
         T_world_camera: (4, 4) m; x right, y down, z forward.
         covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
         taken: time that the photograph states, as EXIF has it; "" if it states none.
@@ -219,7 +219,7 @@ class ScanFile:
 
 
 class Pixels(Interface):
-    """What belongs to the pixels of a view; read or computed at each call, at the size of `view.camera`."""
+    """The pixel data of a view; read or computed at each call, at the size of `view.camera`."""
 
     def picture(self, view: PosedView) -> bytes:
         """The JPEG or PNG file. Raises DataError if it cannot be read."""
@@ -254,12 +254,12 @@ class DataSet:
         identity: differs where anything exported differs; an interrupted export goes on only with the same.
         simulated: nothing of it was measured.
         statement: JSON data on origin, devices, gates and deviations, for `dataset.json`.
-        views: in order of their names.
-        pixels: of the views.
+        views: the views in order of their names.
+        pixels: the views' pixels.
         mesh: ground truth in the world frame.
-        splits: of the names of the views.
+        splits: the splits of the views, by name.
         pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance. Errors that
-            are common to all views may be missing: they cancel in relative poses. None where it is not stated.
+            are common to all views may be missing: they cancel in relative poses. None where it is not known.
         about: the data set as a whole, for its data card and metadata.
         scan_files: the scanner's own export, with its textures.
     """

@@ -44,7 +44,7 @@ def data_set_of(
     stated: DataSetStatement | None = None,
     version: str = FIRST_VERSION,
 ) -> DataSet:
-    """Images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
+    """Return images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
 
     The poses are those of the run's own registration, with the camera that it was made with. Images that were taken
     for the evaluation alone are left out. Control spheres are masked in all images: they were taken away before the
@@ -52,11 +52,11 @@ def data_set_of(
 
     Args:
         summary: the run.
-        not_in_yet: results that have not arrived yet, in words.
+        not_in_yet: texts on results that have not arrived yet.
         personal: False leaves GPS, owner and serial numbers out of the pictures, people and serial numbers out of
             the metadata, and the scanner's own files, which may state anything, out altogether.
         stated: title, licence, ethics, creators and citation; they replace those of the protocol.
-        version: of the data set.
+        version: the data set's version.
 
     Raises:
         DataError: the run has no evaluated registration, no scan, or no registered image.
@@ -198,7 +198,7 @@ def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ..
 
 
 def _sees(view: PosedView, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which of some vertices of the mesh are within the image."""
+    """Return which of some vertices of the mesh are within the image."""
     points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
     camera = view.camera
     before = apply(inverse(view.T_world_camera), points)

@@ -69,11 +69,11 @@ class SceneSphere:
 
 @dataclass(frozen=True, slots=True)
 class MeshColours:
-    """What a surface is coloured by.
+    """The values that a surface is coloured by.
 
     Attributes:
-        values: (V,), of each vertex; with classes, their indices.
-        title: what they are.
+        values: (V,) the value of each vertex; with classes, their indices.
+        title: the title of the values.
         hover: plotly's template of the text at a vertex; "" for none.
         classes: name and colour of each class; empty for values on a scale.
     """
@@ -102,7 +102,7 @@ class SceneMesh:
 
     @property
     def coloured_by(self) -> MeshColours | None:
-        """What the surface is coloured by; None if it has one colour."""
+        """The values that the surface is coloured by; None if it has one colour."""
         if self.colours is not None or self.error_mm is None:
             return self.colours
         return MeshColours(self.error_mm, "predicted error (mm)", "%{intensity:.4f} mm")

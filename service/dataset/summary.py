@@ -64,11 +64,11 @@ class GroundTruth:
     """The mesh of the data set.
 
     Attributes:
-        words: what it is.
-        sha256: of its file.
-        vertices_m: (V, 3).
-        faces: (F, 3).
-        source, sigma_m: (V,) of each vertex, as the fusion stated them; None for a scan.
+        words: a text on what it is.
+        sha256: hash of its file.
+        vertices_m: (V, 3) the vertices in the frame of the scan.
+        faces: (F, 3) indices of the vertices of each face.
+        source, sigma_m: (V,) source and standard deviation of each vertex, as the fusion gave them; None for a scan.
     """
 
     words: str
@@ -172,13 +172,13 @@ MESH = "ground_truth_mesh"  # kind of the mesh's artefact
 
 @dataclass(frozen=True, slots=True)
 class RecordedFusion:
-    """What the record says of the fusion from which the data set's mesh comes.
+    """The recorded fusion from which the data set's mesh comes.
 
     Attributes:
-        step: title of its step.
-        answer: of the job.
-        measures: of the job, by name.
-        spacing_m: of the samples for its Chamfer distance.
+        step: its step's title.
+        answer: the job's answer.
+        measures: the job's measures, by name.
+        spacing_m: spacing of the samples for its Chamfer distance.
         files: its artefacts by kind.
     """
 

@@ -1,4 +1,4 @@
-"""Tells the covariance of each pose of a data set, and their joint one, as far as the record states them."""
+"""Computes the covariance of each pose of a data set, and their joint one, as far as the record states them."""
 
 from __future__ import annotations
 
@@ -103,12 +103,12 @@ _BOTH = (
 
 @dataclass(frozen=True, slots=True)
 class ViewCovariances:
-    """What is stated of the errors of T_scan_camera.
+    """The recorded covariances of the errors of T_scan_camera.
 
     Attributes:
         covariance: (6, 6) by viewpoint, as `View.covariance`.
-        words: what they hold.
-        joint: (6 N, 6 N) of all viewpoints, as `DataSet.pose_errors`; None where it is not stated.
+        words: a text on what they hold.
+        joint: (6 N, 6 N) of all viewpoints, as `DataSet.pose_errors`; None where it is not known.
     """
 
     covariance: dict[str, Array]
@@ -119,7 +119,7 @@ class ViewCovariances:
 def view_covariances(
     summary: RunSummary, own: str, registered: Registration, names: Sequence[str]
 ) -> ViewCovariances:
-    """What the record states of the poses of the run's own registration.
+    """Return what the record states of the errors of the poses of the run's own registration.
 
     Hybrid poses have a covariance each, poses of an arm and of the spheres a joint one. The others have that of the
     registration, seen from each camera, and with it that of the bundle adjustment, where there was one. So have poses
@@ -127,7 +127,7 @@ def view_covariances(
 
     Args:
         summary: the run.
-        own: name of its registration.
+        own: the name of its registration.
         registered: that registration.
         names: viewpoints, in the order of the rows of the joint covariance.
 
@@ -158,7 +158,7 @@ def _blocks(joint: Array) -> list[Array]:
 
 
 def _of_arm(registered: Registration) -> str:
-    """What the covariances of an arm's poses hold, in words."""
+    """Describe what the covariances of an arm's poses hold."""
     words = _ARM if registered.T_scan_camera_given is None else _REFINED
     return words.format(mm=mm(registered.pose_sigma_m or 0.0), mrad=mrad(registered.pose_sigma_rad or 0.0))
 
@@ -177,7 +177,7 @@ def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: T
 
 
 def _of_hybrid(summary: RunSummary) -> dict[str, Array]:
-    """Of the newest hybrid poses from photographs at full size; empty if their covariance is in another frame."""
+    """Return the covariances of the newest hybrid poses from photographs at full size; none in other frames."""
     jobs = [job for step in summary.state.steps.values() for job in step.jobs.values()]
     for job in sorted(jobs, key=lambda job: job.ended_seq, reverse=True):
         reduced = any(job.arguments.get(key) is not None for key in ("reduced_to", "full_camera"))

@@ -38,7 +38,7 @@ def file_log(
     handler: BoundedFile | None = None,
     admits: Callable[[logging.LogRecord], bool] | None = None,
 ) -> Generator[None]:
-    """Within this block, also write log records to `data`/logs: ours from INFO up, other libraries' from WARNING up.
+    """Also write log records to `data`/logs in this block: ours from INFO up, other libraries' from WARNING up.
 
     Args:
         data: the data folder; nothing is written until it exists.

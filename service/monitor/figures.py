@@ -35,7 +35,7 @@ _LAST_CAPTURES = 21  # used for the median time per viewpoint
 
 @dataclass(frozen=True, slots=True)
 class DeviceFigures:
-    """What a run last recorded about a device."""
+    """The state of a device as a run last recorded it."""
 
     run_id: str
     device: str  # name in rig.yaml
@@ -195,7 +195,7 @@ _SILENT_S = 60.0  # a runner's longest call, fetching one photograph, is shorter
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What is wrong with each part; "" if nothing is."""
+    """The problem of each part; "" if it has none."""
 
     database: str
     data_folder: str
@@ -205,7 +205,7 @@ class Health:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """True if no part has a problem."""
         return not (self.database or self.data_folder or self.worker or self.runners or self.second_place)
 
 
@@ -265,7 +265,7 @@ _INTERRUPTS = ("operator_action", "leave_lapsed")
 def read_step_times(store: Store, run_id: str) -> EarlierTimes:
     """Seconds from the beginning of each step's work to its figures, in the earlier runs of the run's protocol.
 
-    Runs of a simulated rig tell nothing of a real one, nor the other way round. Raises StoreError.
+    Runs of a simulated rig say nothing of a real one, nor the other way round. Raises StoreError.
     """
     mine = store.first_event(run_id).payload
     assert isinstance(mine, RunStarted)  # checked when the run was read

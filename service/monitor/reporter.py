@@ -192,7 +192,7 @@ _TOWER: Mapping[Standing, TowerLight] = {
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """What the main loop reported last; a change of it is written at once."""
+    """The last report of the main loop; a change of it is written at once."""
 
     doing: Doing = "unknown"
     step: str = ""
@@ -203,7 +203,7 @@ class _Moment:
 
 @dataclass
 class Reporter:
-    """Told by the runner's thread what goes on; heartbeat threads keep writing it while that thread is busy.
+    """Writes what the runner's thread reports; heartbeat threads go on writing it while that thread is busy.
 
     Only the runner's thread talks to devices, with one exception: while it is in a long call, a heartbeat thread
     reads the pose stream, which satisfies no watchdog (`RobotArm.samples`). A device that does not answer is shown as
@@ -259,11 +259,11 @@ class Reporter:
     def attend(
         self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False, asks: Asks = "", words: str = ""
     ) -> None:
-        """Called by the main loop between calls: read the devices and write the snapshot if it is due.
+        """Read the devices and write the snapshot if it is due; the main loop calls this between its calls.
 
         Args:
-            asks: what people are asked for now; "" for nothing.
-            words: the question, or what goes on, for alerts.
+            asks: the thing that people are asked for now; "" for nothing.
+            words: the text of the question, or of what goes on, for alerts.
         """
         self._activity = ("", 0.0)
         thread = threading.get_native_id()

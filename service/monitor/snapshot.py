@@ -41,7 +41,7 @@ class Message(Record):
 
 
 class Snapshot(Record):
-    """What a runner reports about itself, its devices and its machine. Unknown values are None or "unknown".
+    """A runner's report on itself, its devices and its machine. Unknown values are None or "unknown".
 
     A heartbeat thread writes it (`at_utc_s`) and states since when the main loop has been in a long call
     (`attended_utc_s`), which call that is, and when the robot was last heard from.
@@ -78,7 +78,7 @@ class Snapshot(Record):
         return now_utc_s - self.at_utc_s
 
     def shown(self) -> tuple[object, ...]:
-        """What a screen shows, rounded to visible steps: without rounding, noise would redraw every page."""
+        """Return what a screen shows, rounded to visible steps: without rounding, noise would redraw every page."""
         steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
         seen: dict[str, Any] = dict(self) | {"at_utc_s": 0.0, "activity_utc_s": 0.0, "activity": self.lasting}
         seen |= {"attended_utc_s": self.quiet_s // _QUIET_STEP_S, "robot_utc_s": self.robot_silent_s > STALE_S}
@@ -88,7 +88,7 @@ class Snapshot(Record):
         return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())
 
     def stale(self, now_utc_s: float) -> bool:
-        """Whether it is by now too old to tell the current state, or from before the clock was set back."""
+        """Return whether it is too old by now to show the current state, or is from before the clock was set back."""
         return abs(self.age_s(now_utc_s)) > (STARTING_S if self.doing == "starting" else STALE_S)
 
     @property
@@ -174,7 +174,7 @@ def write_frame(data: Path, run_id: str, jpeg: bytes, camera: str = "") -> None:
 
 
 def frame_path(data: Path, run_id: str, camera: str = "") -> Path:
-    """Path of the latest frame of a camera, which may not exist; its modification time tells its age."""
+    """Return the path of a camera's latest frame, which may not exist; its modification time shows its age."""
     named = f"{hashlib.sha256(camera.encode()).hexdigest()[:16]}." if camera else ""
     return _path(data, run_id, f"{named}jpg")
 
@@ -192,7 +192,7 @@ _log = logging.getLogger(__name__)
 
 
 class WorkerSign(Record):
-    """What a worker reports about itself."""
+    """A worker's report on itself."""
 
     host: str
     pid: int
@@ -200,7 +200,7 @@ class WorkerSign(Record):
     jobs_done: int
 
     def lives(self, now_utc_s: float) -> bool:
-        """Whether it has reported lately, by now, and is not known to be dead."""
+        """Return whether the worker has reported lately, by now, and is not known to be dead."""
         if self.host == socket.gethostname() and not psutil.pid_exists(self.pid):
             return False
         return abs(now_utc_s - self.at_utc_s) <= _STALE_S

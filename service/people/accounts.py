@@ -58,11 +58,11 @@ class Accounts:
             return to_account(get_account(connection, account))
 
     def strangers_wait(self, account: Account) -> bool:
-        """Whether wrong passwords have closed the account to strangers; both clocks must say that it is over."""
+        """Return whether wrong passwords still close the account to strangers, until both clocks say it is over."""
         return self._store.ages.at_least_s(account.locked_until_utc_s) < 0
 
     def waits_until_utc_s(self, account: Account) -> float:
-        """Until when somebody has to wait after wrong passwords of the account; 0 if nobody has to."""
+        """Return until when somebody has to wait after wrong passwords of the account; 0 if nobody has to."""
         known_s = self._known.longest_wait_s(account.account)
         strangers_s = account.locked_until_utc_s if self.strangers_wait(account) else 0.0
         return max(strangers_s, self._store.clock.utc_s() + known_s if known_s else 0.0)

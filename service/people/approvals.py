@@ -29,7 +29,7 @@ class Approval:
 
 @dataclass(frozen=True, slots=True)
 class ProtocolStanding:
-    """Whether a protocol file is approved on a site.
+    """The standing of a protocol file on a site: its approval, or that of another content.
 
     Attributes:
         approval: the approval of exactly this content; None if there is none.
@@ -41,7 +41,7 @@ class ProtocolStanding:
 
     @property
     def changed(self) -> bool:
-        """Whether this content is not approved, but other content of the same id and version is."""
+        """True if this content is not approved, but other content of the same id and version is."""
         return self.approval is None and self.other is not None
 
 

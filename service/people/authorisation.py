@@ -92,7 +92,7 @@ def identify(
         role: the role that the action needs.
         secret: asks for the secret; not called on a site without accounts, where the name is a claim.
         known_by: the kind of secret: the account's password, PIN or badge.
-        origin: where it is typed.
+        origin: the place where the secret is typed.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.

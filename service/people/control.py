@@ -25,7 +25,7 @@ _DECIDE_AGAIN = "Read what the page shows now and decide again; nothing was done
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who has control of a run, who asks for it, and who was refused it; "" for nobody.
+    """The holder of control of a run, who asks for it, and who was refused it; "" for nobody.
 
     When a sign-in ends, so does its control.
     """
@@ -53,7 +53,7 @@ class Control:
         self._store = store
 
     def holder(self, run_id: str) -> Holder:
-        """Who has control of the run now. Raises UnknownRunError."""
+        """Return who has control of the run now. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
             return self._holder(connection, run_id)
 

@@ -42,7 +42,7 @@ def wait_after_s(failures: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class SecretOrigin:
-    """Where a secret is typed: at a browser's address, on a screen that is signed in, or at a terminal."""
+    """The place where a secret is typed: a browser's address, a screen that is signed in, or a terminal."""
 
     address: str = ""  # of the browser that signs in
     screen: str = ""
@@ -58,7 +58,10 @@ def on_screen_of(person: Person) -> SecretOrigin:
 
 
 def _counted_at(account: str, origin: SecretOrigin) -> tuple[str, str, str]:
-    """Which tries are counted together. For another's secret that is who typed it: a new sign-in is no new count."""
+    """Return the key of the tries that are counted together.
+
+    For another's secret the key is who typed it, so that a new sign-in starts no new count.
+    """
     if not origin.by:
         return account, "address", origin.address
     return (account, "screen", origin.screen) if origin.by == account else (account, "by", origin.by)
@@ -71,7 +74,7 @@ class KnownTries:
         self._store = store
 
     def knows(self, account: str, origin: SecretOrigin) -> bool:
-        """Whether the origin is a screen, a terminal, or an address from which the account has signed in."""
+        """Return whether the origin is a screen, a terminal, or an address from which the account has signed in."""
         return bool(origin.by) or origin == TERMINAL or (account, origin.address) in self._addresses
 
     def wait_s(self, account: str, origin: SecretOrigin) -> float:
@@ -88,7 +91,7 @@ class KnownTries:
         self._failed.setdefault(_counted_at(account, origin), _new_count()).append(at_s)
 
     def succeeded(self, account: str, origin: SecretOrigin) -> None:
-        """Begin to count anew after the right password; a sign-in makes its address known."""
+        """Start the count again after the right password; a sign-in makes its address known."""
         self._failed.pop(_counted_at(account, origin), None)
         if origin.address and not origin.by:
             self._addresses.add((account, origin.address))
@@ -104,7 +107,7 @@ class KnownTries:
         return max(0.0, left_s)
 
     def _ended_after(self, account: str, monotonic_s: float) -> bool:
-        """Whether an administrator has ended the account's waits since; perhaps from another process."""
+        """Return whether an administrator has ended the account's waits since; perhaps from another process."""
         ended = (
             _OF_SITE.where(
                 event_index.c.kind == "account_changed",
@@ -196,7 +199,7 @@ def _new_count() -> deque[float]:
 
 
 def _is_wrong(event: SignInRecorded) -> bool:
-    """Whether a secret was wrong, and it was counted; while one waits, nothing is."""
+    """Return whether a secret was wrong and was counted; nothing is counted while somebody has to wait."""
     return event.outcome == "refused" and event.account != ""
 
 

@@ -28,7 +28,7 @@ _REMEDY = (
 
 
 def is_shared(folder: Path) -> bool:
-    """Whether a folder is shared with its group on purpose. Raises OSError."""
+    """Return whether a folder is shared with its group on purpose. Raises OSError."""
     return folder.stat().st_mode & _SHARED == _SHARED
 
 
@@ -127,7 +127,7 @@ def close_to_others(folder: Path, database: str) -> None:
 
 
 def _differs(database: Path, kept: int, group: int) -> bool:
-    """Whether a database is for others than its folder. One that does not exist is not."""
+    """Return whether a database is shared otherwise than its folder; one that does not exist is not."""
     try:
         held = database.stat()
     except FileNotFoundError:

@@ -138,7 +138,7 @@ class ArtefactFiles:
             self._durable_shards.add(shard)
 
     def _made_young(self, target: Path) -> bool:
-        """Whether the file exists; if so, touch it, so that it is not removed as an old leftover."""
+        """Touch the file, so that it is not removed as an old leftover. Returns whether it exists."""
         with _locked(self._folder, fcntl.LOCK_SH):
             try:
                 os.utime(target)

@@ -1,4 +1,4 @@
-"""Tells the used and free disk space and what could be deleted, and removes the files that crashes left."""
+"""Measures the used and free disk space, lists what could be deleted, and removes the files that crashes left."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def require_space(store: Store, found: Forecast) -> None:
 
 
 def require_export_space(store: Store, run_id: str, target: Path) -> None:
-    """Raise SpaceShortError if a copy of a run's files would not fit or would use space kept for the evidence."""
+    """Raise SpaceShortError if a copy of a run's files would not fit or would use space reserved for the evidence."""
     with store.database.reading() as connection:
         usage = read_usage(connection, run_id)
     needed = usage.view_bytes + usage.computed_bytes + usage.other_bytes
@@ -247,9 +247,9 @@ def _judged(
 
 
 def _set_forward_s(connection: Connection, clock: Clock) -> float:
-    """By how much UTC has gone on farther than the monotonic clock since the newest event; 0 if it has not.
+    """Return how much farther UTC has gone on than the monotonic clock since the newest event, s; 0 if it has not.
 
-    So much younger a file may be than it seems. Where the host was restarted since, this is 0 or makes files stay.
+    A file may be that much younger than it seems. Where the host was restarted since, this is 0 or makes files stay.
     """
     newest = select(events.c.at_utc, events.c.monotonic_s).join(
         event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)

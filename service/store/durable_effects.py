@@ -123,14 +123,14 @@ def _sync(path: Path, flags: int) -> None:
 
 
 class Signal(Protocol):
-    """What one thread sets and others wait for, as long as a clock says; a `threading.Event` is one."""
+    """A signal that one thread sets and others wait for, as long as a clock says; a `threading.Event` is one."""
 
     def set(self) -> None:
         """Wake all that wait, and let nobody wait any more."""
         ...
 
     def is_set(self) -> bool:
-        """Whether it was set."""
+        """Return whether it was set."""
         ...
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -139,7 +139,7 @@ class Signal(Protocol):
 
 
 class Clock(Protocol):
-    """The source of times, and of waits: whatever waits for a time to come waits on the clock that tells it."""
+    """The source of times, and of waits: whatever waits for a time to come waits on the clock that shows it."""
 
     def utc_now(self) -> datetime:
         """The present time in UTC, timezone-aware."""

@@ -97,7 +97,7 @@ def started(connection: Connection, clock: Clock, run_id: str) -> dict[str, str]
 
 @dataclass(frozen=True, slots=True)
 class JobChoice:
-    """Which jobs a worker may claim; None allows every kind, every run, every lane."""
+    """The jobs that a worker may claim; None allows every kind, every run, every lane."""
 
     kinds: Collection[str] | None
     run_id: str | None
@@ -144,7 +144,10 @@ def claim(
 
 
 def _take_over(connection: Connection, clock: Clock, row: Row[Any]) -> bool:
-    """Whether another worker may have this running job. Records the loss of its worker, and fails it at its limit."""
+    """Return whether another worker may have this running job.
+
+    Records the loss of its worker, and fails the job at its limit of tries.
+    """
     if clock.utc_s() < row.until_utc_s and identity_of(row).life() != "dead":
         return False
     _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
@@ -178,7 +181,7 @@ def finish(connection: Connection, clock: Clock, job: Job, payload: JobFinished)
 
 
 def release(connection: Connection, pids: Collection[int]) -> None:
-    """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
+    """Queue the jobs of these local processes again without counting a try: they were asked to stop and have."""
     here = ProcessIdentity.of_this_process()
     mine = (jobs.c.state == "running", jobs.c.host == here.host, jobs.c.boot == here.boot, jobs.c.pid.in_(pids))
     values = {"state": "queued", "tries": jobs.c.tries - 1, "token": None, "until_utc_s": None}
@@ -213,7 +216,7 @@ def fail(
 
 
 def holds(connection: Connection, job: Job) -> bool:
-    """Whether the lease of a job is still `job.token`."""
+    """Return whether the lease of a job is still `job.token`."""
     row = connection.execute(select(jobs.c.state, jobs.c.token).where(jobs.c.job_id == job.job_id)).one_or_none()
     return row is not None and row.state == "running" and row.token == job.token
 

@@ -119,7 +119,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ProcessIdentity:
-    """The process that holds a lease, so that another process on the same host can tell whether it is still alive.
+    """The process that holds a lease, so that another process on the same host can see whether it is still alive.
 
     `process_started_s` counts from boot, not from an epoch, so that setting the system clock does not change it.
     """
@@ -136,7 +136,7 @@ class ProcessIdentity:
         return cls(socket.gethostname(), _boot(), process.pid, _started_s(process))
 
     def life(self) -> Literal["lives", "dead", "unknown"]:
-        """Whether the process is alive; unknown for a process on another host. A stopped process is alive."""
+        """Return whether the process is alive; unknown for a process on another host. A stopped process is alive."""
         if self.host != socket.gethostname():
             return "unknown"
         if self.boot != _boot():
@@ -222,7 +222,7 @@ class RunLease:
 
 
 def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
-    """Whether a process that may still be alive holds the lease of a run."""
+    """Return whether a process that may still be alive holds the lease of a run."""
     row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
     return row is not None and is_live(row, clock.utc_s())
 
@@ -235,7 +235,7 @@ def held_runs(connection: Connection, clock: Clock) -> list[str]:
 
 
 def is_live(row: Row[Any], now_utc_s: float) -> bool:
-    """Whether the holder in a row of `leases` or `jobs` may be alive; on another host, until its lease expires."""
+    """Return whether the holder in a row of `leases` or `jobs` may be alive; elsewhere, until the lease expires."""
     life = identity_of(row).life()
     return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
 

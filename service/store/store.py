@@ -300,7 +300,7 @@ class Store:
             return read_artefacts(connection, run_id)
 
     def holds(self, run_id: str, sha256: str) -> bool:
-        """Whether a run has recorded a file with this content."""
+        """Return whether a run has recorded a file with this content."""
         found = select(artefacts.c.seq).where(artefacts.c.sha256 == sha256, artefacts.c.run_id == run_id).limit(1)
         with self._database.reading() as connection:
             return connection.execute(found).first() is not None
@@ -322,7 +322,7 @@ class Store:
         return acquire(self._database, self._clock, self._ids, run_id=run_id, holder=holder, seconds=seconds)
 
     def driven(self, run_id: str) -> bool:
-        """Whether a living process holds the lease of a run."""
+        """Return whether a living process holds the lease of a run."""
         with self._database.reading() as connection:
             return is_held(connection, self._clock, run_id)
 
@@ -438,7 +438,7 @@ class Store:
         return events
 
     def holds_job(self, job: Job) -> bool:
-        """Whether a claimed job is still this worker's: not cancelled, not failed, not taken over."""
+        """Return whether a claimed job is still this worker's: not cancelled, not failed, not taken over."""
         with self._database.reading() as connection:
             return queue.holds(connection, job)
 
@@ -454,7 +454,7 @@ class Store:
         return event
 
     def release_jobs(self, pids: Collection[int]) -> None:
-        """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
+        """Queue the jobs of these local processes again without counting a try: they were asked to stop and have."""
         with self._database.writing() as connection:
             queue.release(connection, pids)
 

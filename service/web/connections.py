@@ -243,7 +243,7 @@ class Listener(socket.socket):
 
 
 class _AcceptedSocket(socket.socket):
-    """An accepted socket that tells when it is closed."""
+    """An accepted socket that reports when it is closed."""
 
     def __init__(self, plain: socket.socket, wait_s: float) -> None:
         super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
@@ -264,7 +264,7 @@ class _AcceptedSocket(socket.socket):
 
 
 def _nothing() -> None:
-    """Stand in until somebody asks to be told that a connection was closed."""
+    """Stand in until somebody asks for a call when a connection is closed."""
 
 
 def affordable_connections(wanted: int) -> int:

@@ -308,11 +308,11 @@ class Guard:
 
 
 def requires(permission: Permission, *, while_locked: bool | tuple[str, ...] = False) -> Guard:
-    """The guard of a route: `dependencies=[Depends(requires("read"))]`.
+    """Return the guard of a route: `dependencies=[Depends(requires("read"))]`.
 
     Args:
-        permission: of service.people.person.
-        while_locked: whether a locked screen may do it too; or the values of the form field `verb` that it may do.
+        permission: a permission of service.people.person.
+        while_locked: true if a locked screen may do it too; or the values of the form field `verb` that it may do.
     """
     return Guard(permission, while_locked)
 

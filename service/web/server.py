@@ -140,7 +140,7 @@ Kind = tuple[str | int, ...]
 
 @dataclass(slots=True)
 class _Repeats:
-    """What was said of one kind since `since_s`."""
+    """The messages of one kind since `since_s`."""
 
     since_s: float
     name: str
@@ -198,7 +198,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
 
 
 def told(record: logging.LogRecord) -> bool:
-    """Whether the sparing handler, which comes first, has not left this message out."""
+    """Return whether the sparing handler, which comes first, wrote this message rather than leave it out."""
     return not vars(record).get(_LEFT_OUT)
 
 
@@ -286,7 +286,7 @@ def server(
 
 
 class Server(uvicorn.Server):
-    """Ends in order when told to; uvicorn's own would raise the signal again, past what is left to do here."""
+    """A server that ends in order; uvicorn's own would raise the signal again, past what is left to do here."""
 
     @contextmanager
     def capture_signals(self) -> Generator[None]:

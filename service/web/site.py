@@ -37,7 +37,7 @@ class Launcher:
     _lock: Lock = field(default_factory=Lock)
 
     def driven(self, run_id: str) -> bool:
-        """Whether a living process drives the run, or one has just been started to do so."""
+        """Return whether a living process drives the run, or one has just been started to do so."""
         with self._lock:
             child = self._children.get(run_id)
             if child is not None and child.poll() is None:

@@ -144,10 +144,10 @@ devices told the truth, or that nobody but the site had the key.
 
 
 def readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -> str:
-    """The text of README.txt.
+    """Return the text of README.txt.
 
     Args:
-        run_id: of the run.
+        run_id: the run's identifier.
         key_id: fingerprint of the site's signing key.
         root: the run's first event.
         missing: results that have not arrived yet, in words.
@@ -195,10 +195,10 @@ class BundledRun:
     """A run as one transaction sees it.
 
     Attributes:
-        head: of the run's chain.
-        site_head: of the site's chain.
+        head: the head of the run's chain.
+        site_head: the head of the site's chain.
         artefacts: every recorded file, once for each event that brought it.
-        full_names: of accounts.
+        full_names: people's full names, by account.
         missing: results that have not arrived yet, in words.
         keys: the site's public keys, oldest first.
     """

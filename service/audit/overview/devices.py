@@ -68,7 +68,7 @@ class ClockSeries:
 def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
     """The robot controller's clock minus the host's monotonic one, as every capture recorded it.
 
-    Each start of the runner has a series of its own: the host's monotonic clock begins anew with every boot.
+    Each start of the runner has a series of its own: the host's monotonic clock starts again with every boot.
     """
     rows = connection.execute(
         text(

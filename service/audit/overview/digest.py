@@ -104,7 +104,7 @@ class Digest:
 
 
 def digests(store: Store) -> IncrementalResults[Digest]:
-    """Digests of a data folder's runs, kept up to date in the background."""
+    """Digests of a data folder's runs, updated in the background."""
     return IncrementalResults(store, lambda run_id, before: step(store, run_id, before), "digest")
 
 

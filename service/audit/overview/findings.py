@@ -102,7 +102,7 @@ def value_at(payload: Mapping[str, Any], path: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """What one attempt of a step measured."""
+    """The measures of one attempt of a step."""
 
     attempt: int
     seq: int

@@ -186,7 +186,10 @@ def verified(verification: Verification | None, head_sha256: str) -> str:
 
 
 def matches(run: ListedRun, wanted: RunFilter) -> bool:
-    """Whether a run matches, words aside (`find_runs`). A run whose digest is not known yet is not hidden."""
+    """Return whether a run matches the filter, leaving aside its search words, which `find_runs` compares.
+
+    A run whose digest is not known yet is not hidden.
+    """
     basics, digest = run.basics, run.digest
     day = basics.created_utc[:10]
     fits = (

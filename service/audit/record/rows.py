@@ -23,7 +23,7 @@ LARGEST_SEQ = 2**53
 
 @dataclass(frozen=True, slots=True)
 class RunBasics:
-    """What never changes in a run, and the present end of its chain."""
+    """The facts of a run that never change, and the present end of its chain."""
 
     run_id: str
     created_utc: str

@@ -20,7 +20,7 @@ class Filter:
 
     @property
     def active(self) -> bool:
-        """Whether anything is filtered."""
+        """True if any filter is set."""
         return bool(self.query())
 
     def query(self) -> dict[str, str]:
@@ -248,7 +248,7 @@ class ArtefactRow:
 
     @property
     def is_picture(self) -> bool:
-        """Whether a browser can show it."""
+        """True if a browser can show the file."""
         return self.media_type in ("image/jpeg", "image/png")
 
 

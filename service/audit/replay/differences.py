@@ -52,13 +52,13 @@ class Difference:
 
     @property
     def wording(self) -> bool:
-        """Whether only the wording of an explanation differs: the numbers that it explains are compared."""
+        """True if only the wording of an explanation differs: the numbers that it explains are compared."""
         texts = isinstance(self.recorded, str) and isinstance(self.recomputed, str)
         return texts and self.path.rpartition(".")[2] in _EXPLANATIONS
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether at most rounding or the wording of an explanation differs."""
+        """True if at most rounding or the wording of an explanation differs."""
         return self.wording or (self.relative is not None and self.relative <= TOLERANCE)
 
 
@@ -71,12 +71,12 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether both are bit-identical."""
+        """True if recorded and recomputed data are bit-identical."""
         return not self.differences
 
     @property
     def equal(self) -> bool:
-        """Whether nothing but rounding differs."""
+        """True if nothing but rounding or wording differs."""
         return all(d.within_tolerance for d in self.differences)
 
     def of_recorded(self) -> Comparison:
@@ -118,8 +118,8 @@ def compare_data(
     """Compare plain data (what JSON can hold) number by number.
 
     Args:
-        recorded: from the evidence.
-        recomputed: by the replay.
+        recorded: the data in the evidence.
+        recomputed: the data that the replay computed.
         path: prefix of every path.
         renamed: hashes of recomputed files: recorded → recomputed.
     """
@@ -222,7 +222,7 @@ def _is_pose(path: str) -> bool:
 
 
 def _is_table(mapping: Mapping[str, Any]) -> bool:
-    """Whether a mapping has many entries of one form, such as viewpoints, and so counts as one field."""
+    """Return whether a mapping has many entries of one type, such as viewpoints, and so counts as one field."""
     kinds = {type(value) for value in mapping.values()}
     return len(mapping) > 5 and len(kinds) == 1 and kinds <= {list, tuple, dict}
 

@@ -1,4 +1,4 @@
-"""Keeps the answers that a replay has computed as input of later jobs, in its own folder, and tells their drift."""
+"""Stores the answers that a replay has computed as input of later jobs in its own folder; reports their drift."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _key(value: Any) -> str:
 
 
 def _is_telling(value: Any) -> bool:
-    """Whether this holds a number with so many digits that equality means a copy."""
+    """Return whether a value holds a number with so many digits that equality means a copy."""
     if isinstance(value, float):
         digits = repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")
         return len(digits) >= _TELLING_DIGITS and value.as_integer_ratio()[0].bit_length() >= _TELLING_BITS

@@ -69,7 +69,7 @@ class JobReplay:
 
     @property
     def differences(self) -> tuple[Difference, ...]:
-        """Of measures, result and files, in this order, each worst first."""
+        """The differences of measures, result and files, in this order, each worst first."""
         parts = (self.measures, self.result, *(artefact.content for artefact in self.artefacts))
         return tuple(difference for part in parts for difference in part.differences)
 
@@ -139,8 +139,8 @@ def replay(
     gets the recomputed ones. Nothing is written into the data folder.
 
     Args:
-        run: as `read_run` gives it.
-        kinds: of jobs.
+        run: the run, as `read_run` returns it.
+        kinds: the kinds of jobs to compute.
         step: only this step's jobs.
         end_to_end: feed each job the recomputed results; the report then has the drift of each registration.
         out: folder to keep the recomputed files in, by step, job and name.

@@ -322,7 +322,7 @@ def _hand_eye(solved: calibrate.Answer) -> Iterator[Block]:
 
 
 def _validity(run: RecordedRun, step_id: str) -> Iterator[Block]:
-    """What the certificate is valid for, and the gates that watch it."""
+    """Yield the section on what the certificate is valid for, and on the gates that watch it."""
     yield Heading("Validity, and what makes a new calibration necessary")
     yield Paragraph(
         "It holds for this camera, lens and mount as long as zoom, focus, aperture and the screws between flange and "

@@ -117,13 +117,13 @@ def report_content(
     with_scene: bool = True,
     with_pictures: bool = True,
 ) -> Report:
-    """The report of a run.
+    """Return the report of a run.
 
     Args:
         run: the run.
         audit: the result of the verification, which is shown on the first page.
         made_at: the time stamp of the report, default: now. The same evidence and time stamp give the same report.
-        true_error_mm: by source of poses, on a simulated rig, where the truth is known; marked as such.
+        true_error_mm: the true error by source of poses, which only a simulated rig knows; it is marked as such.
         with_scene: include the scene that can be turned, which only HTML can show; its drawing is always included.
         with_pictures: False leaves out everything that shows photographs.
     """
@@ -156,7 +156,7 @@ def _sections(
     with_scene: bool,
     with_pictures: bool,
 ) -> list[Section | None]:
-    """In the order of the report; None for a section that this run does not have."""
+    """Return the sections in the order of the report; None stands for a section that this run does not have."""
     omitted = Paragraph("They were left out, because this report belongs to a bundle without files.")
     summary = run.summary()
     return [

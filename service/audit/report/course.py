@@ -61,7 +61,7 @@ def deviations(run: RecordedRun) -> list[NotableEvent]:
 
 
 def incidents(run: RecordedRun) -> list[NotableEvent]:
-    """What else a reader must know of, and is no deviation: failed gates, faults, corrections, what is not done."""
+    """List what a reader must know that is no deviation: failed gates, faults, corrections, what was not done."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found: list[NotableEvent] = []
     for event in run.events:

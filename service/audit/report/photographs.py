@@ -58,7 +58,7 @@ _PIECE_CHARACTERS = 900
 
 
 def about_facts(run: RecordedRun) -> list[tuple[str, TableCell | str]]:
-    """What was entered when the run began; empty for old runs, which did not ask."""
+    """Return what was entered when the run began; it is empty for old runs, which did not ask."""
     rows: list[tuple[str, TableCell | str]] = []
     for name, value in about_rows(run.root.about):
         rows += [(name if part == 0 else "", text) for part, text in enumerate(_pieces(value))]

@@ -45,7 +45,7 @@ class _Geometry:
         segments: (N, 2, 3) float32, and `strokes`: (N, 3) uint8.
         labels: text and where it stands.
         legend: colour and what it stands for.
-        error_mm: what the first and the last colour of the mesh stand for; None: one colour alone.
+        error_mm: the errors that the first and the last colour of the mesh stand for; None: it has one colour.
     """
 
     points: NDArray[np.float32]

@@ -153,7 +153,7 @@ def _calibrations(connection: Connection) -> dict[str, tuple[_CalibrationResult,
 
 
 def _devices(connection: Connection) -> dict[str, dict[str, RecordedIdentity]]:
-    """By run and name in rig.yaml: the identity that a device stated when it was last opened."""
+    """Return by run and name in rig.yaml the identity that a device reported when it was last opened."""
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.device') AS device, "
@@ -170,7 +170,7 @@ def _devices(connection: Connection) -> dict[str, dict[str, RecordedIdentity]]:
 
 
 def _optics(connection: Connection) -> dict[str, RecordedOptics]:
-    """By run: what the first photograph states of camera and lens."""
+    """Return by run what the first photograph states of camera and lens."""
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM runs AS r CROSS JOIN events AS e "

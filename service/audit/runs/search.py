@@ -40,7 +40,7 @@ class RunSearch:
 
     @property
     def active(self) -> bool:
-        """Whether any field is set."""
+        """True if any field is set."""
         return any((self.q.strip(), self.since, self.until, self.result))
 
     def query(self) -> dict[str, str]:
@@ -81,7 +81,7 @@ class FoundRun:
     accuracy: Accuracy | None
 
     def has(self, result: str) -> bool:
-        """Whether it has this result, one of RESULTS."""
+        """Return whether the run has this result, one of RESULTS."""
         if result == "released":
             return self.released
         if result in ("within", "outside"):

@@ -167,7 +167,7 @@ def number(value: float) -> str:
 
 
 def short_words(error: Exception) -> str:
-    """What an error says, without the bytes that some carry along."""
+    """Return an error's type and message, cut to 200 characters because some messages carry bytes along."""
     return f"{type(error).__name__}: {error}"[:200]
 
 
@@ -288,7 +288,7 @@ def _offset(listed: tuple[zipfile.ZipInfo, bytes]) -> int:
 
 
 class ZipLayout:
-    """Where the parts of a zip file lie. Entries and directory must cover it without a gap, as they were written."""
+    """The layout of a zip file's parts. Entries and directory must cover it without a gap, as they were written."""
 
     _END, _END_64, _LOCATOR_64 = b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
     _CENTRAL, _LOCAL = b"PK\x01\x02", b"PK\x03\x04"
@@ -300,7 +300,7 @@ class ZipLayout:
         self._size = size
 
     def problems(self, infos: Sequence[zipfile.ZipInfo]) -> list[str]:
-        """What keeps this from being exactly one zip file."""
+        """List what keeps this from being exactly one zip file."""
         try:
             start, end, count = self._directory()
             names = self._directory_names(start, end)
@@ -315,7 +315,7 @@ class ZipLayout:
         return self._stream.read(size)
 
     def _directory(self) -> tuple[int, int, int]:
-        """Where the directory begins and ends, and how many files it lists. Raises ValueError."""
+        """Return where the directory begins and ends, and how many files it lists. Raises ValueError."""
         end = self._size - 22
         last = self._at(max(end, 0), 22)
         if not last.startswith(self._END) or last[20:] != b"\0\0":
@@ -936,13 +936,13 @@ def references_in(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def statement(item: Mapping[str, Any]) -> bytes:
-    """What a checkpoint signs."""
+    """Return the bytes that a checkpoint's signature covers."""
     named = {name: value for name, value in item.items() if name != "signature"}
     return canonical(dict(named, purpose=CHECKPOINT))
 
 
 def signature_fits(item: Mapping[str, Any], raw: bytes) -> bool:
-    """Whether a checkpoint is signed by this key."""
+    """Return whether a checkpoint is signed by this key."""
     try:
         signature = base64.b64decode(str(item.get("signature")), validate=True)
     except ValueError:
@@ -951,7 +951,7 @@ def signature_fits(item: Mapping[str, Any], raw: bytes) -> bool:
 
 
 def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
-    """Whether a signature is this key's over this message."""
+    """Return whether a signature is this key's over this message."""
     try:
         Ed25519PublicKey.from_public_bytes(raw).verify(signature, message)
     except (InvalidSignature, ValueError):
@@ -960,7 +960,7 @@ def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
 
 
 def in_use(item: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
-    """Whether a key was in use when an item was signed. A key's last act is to sign the key that replaces it."""
+    """Return whether a key was in use when an item was signed. Its last act is to sign the key that replaces it."""
     at, replaced = item["site_seq"], key["replaced_seq"]
     if replaced is None or at < replaced:
         return bool(at >= key["seq"])

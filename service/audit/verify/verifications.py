@@ -1,4 +1,4 @@
-"""Verifications started in the browser: each is done by a process of its own, and the result is kept in a file.
+"""Verifications started in the browser: each is done by a process of its own, and the result is stored in a file.
 
 The result is a note beside the data, not evidence: if in doubt, verify again.
 """
@@ -31,7 +31,7 @@ class VerifiedFault(Record):
 
 
 class Outcome(Record):
-    """What a verification found."""
+    """The findings of a verification."""
 
     ok: bool
     events: int

@@ -73,7 +73,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 
 
 def stamps_ns(views: Sequence[PosedView]) -> dict[str, int]:
-    """The stamp of each view, ns since 1970: of its photograph; counted if one lacks or repeats its time."""
+    """Return each view's stamp, ns since 1970, of its photograph; counted if a time is missing or repeated."""
     taken = {view.name: _time_ns(view.taken) for view in views}
     known = {name: stamp for name, stamp in taken.items() if stamp is not None}
     if len(set(known.values())) == len(views):

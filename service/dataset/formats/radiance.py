@@ -35,7 +35,7 @@ class UnitBox:
         return T
 
     def record(self, dataset: DataSet, mesh_axes: tuple[int, int, int]) -> dict[str, object]:
-        """As JSON, to bring a saved mesh to the world: scale, centre, and which of its axes are the world's x, y, z.
+        """Return JSON data to bring a saved mesh to the world: scale, centre, and which axes are the world's x, y, z.
 
         The programs undo the scale when they save a mesh, so only the centre has to be added.
         """

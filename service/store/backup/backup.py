@@ -50,7 +50,7 @@ class BackupReport:
 
 @dataclass(frozen=True, slots=True)
 class BackupOptions:
-    """What a backup does besides copying what is new.
+    """The options of a backup, besides copying what is new.
 
     Attributes:
         with_keys: also copy the private signing key.
@@ -80,7 +80,7 @@ def back_up(
     Args:
         data_dir: the data folder, which a run may be using.
         destination: the folder of backups: new, empty, or with earlier backups of this data folder.
-        options: what else to do.
+        options: the backup's options.
         progress: called with the number of bytes copied.
         files: durable file operations.
         clock: gives the state its name.
@@ -113,7 +113,7 @@ def _silent(_what: str, _done: int, _total: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _ReferencedFiles:
-    """What the copied database refers to."""
+    """The files, chains and journal line that the copied database refers to."""
 
     sizes: dict[str, int]  # sizes of files, by hash
     heads: dict[str, tuple[int, str]]
@@ -175,7 +175,7 @@ class _Backup:
                 self.folder.discard(self.folder.path(old))
 
     def _read_copy(self, part: Path) -> tuple[_ReferencedFiles, set[tuple[str, int]]]:
-        """What the copied database refers to, and the (run, seq) of its signatures."""
+        """Return what the copied database refers to, and the (run, seq) of its signatures."""
         copy = open_read_only(part, self.folder.files)
         try:
             with copy.reading() as connection:
@@ -206,7 +206,7 @@ class _Backup:
     def _copy_journal(self, part: Path, line: int) -> str:
         """Copy the journal up to the line that the database copy holds. Returns the copy's SHA-256; "" without lines.
 
-        A journal that lacks the line, or was altered, is copied as it is, for the audit to find.
+        A journal without the line, or an altered one, is copied as it is, for the audit to find.
         """
         journal = self.data_dir / JOURNAL_NAME
         if not line or not journal.is_file():
@@ -323,7 +323,7 @@ class _Backup:
 
 
 def _fault_of(source: Path, sha256: str) -> str:
-    """What is wrong with a file of the data folder; "" if nothing is."""
+    """Return what is wrong with a file of the data folder; "" if nothing is."""
     shown = f"artefacts/{relative_path(sha256)}"
     try:
         return "" if hash_file(source)[0] == sha256 else f"{shown}: the file was altered; it is not in the backup"

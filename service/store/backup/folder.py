@@ -35,7 +35,7 @@ _SAYS = {"format": 1, "purpose": "backups of one orthocapture data folder"}
 
 
 class BackupState(Record):
-    """What one backup holds; written last."""
+    """The content of one backup; written last."""
 
     format: Literal[1] = 1
     at_utc: str

@@ -83,7 +83,7 @@ def _image(name: str, row: Sequence[Value]) -> RowImage:
 
 
 def is_known(row: RowImage) -> bool:
-    """Whether the journal keeps this table, and the row has its key and no foreign column."""
+    """Return whether the journal keeps this table, and the row has its key and no foreign column."""
     columns = _COLUMNS.get(row.table, ())
     return set(_KEYS.get(row.table, ("",))) <= row.values.keys() <= set(columns)
 

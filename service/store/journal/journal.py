@@ -50,12 +50,12 @@ class Tail:
 
     Attributes:
         place: device and inode of the file.
-        number: of the last line.
+        number: the last line's number.
         after: number of the line that the database held before the last line's transaction.
-        sha256: of the last line.
-        start: its offset in the file.
+        sha256: the last line's hash.
+        start: the last line's offset in the file.
         end: the offset after it.
-        word: what its mark says; None if it has none.
+        word: the word of its mark; None if it has none.
     """
 
     place: tuple[int, int]
@@ -105,7 +105,7 @@ class Journal:
         return found
 
     def require_not_cut(self, tail: Tail | None, held: int) -> None:
-        """Raise RecordDamagedError if the journal lacks a line of the database; `tail` was read after `held`."""
+        """Raise RecordDamagedError if the journal misses a line of the database; `tail` was read after `held`."""
         if tail is None and held:
             raise RecordDamagedError(
                 f"{NAME} is missing or empty, and the database holds its line {held}: the journal was removed or cut",
@@ -121,7 +121,7 @@ class Journal:
             )
 
     def require_not_behind(self, tail: Tail | None, held: int) -> None:
-        """Raise RecordDamagedError if the database lacks a committed line; `tail` was read before `held`."""
+        """Raise RecordDamagedError if the database misses a committed line; `tail` was read before `held`."""
         if tail is None or held >= tail.number or (held == tail.after and tail.word != "committed"):
             return
         raise RecordDamagedError(
@@ -135,7 +135,7 @@ class Journal:
         """Append the changes of a transaction durably, before it is committed. Raises OSError, StoreError.
 
         Args:
-            rows: what the transaction leaves behind.
+            rows: the rows as the transaction leaves them.
             held: number of the line that the database holds, as it was compared with the tail.
         """
         tail = self._known
@@ -173,8 +173,8 @@ class Journal:
     def mark(self, tail: Tail, word: Word) -> None:
         """Say what became of the last line's transaction, unless another line follows already.
 
-        The mark is not synced: it helps to tell an interrupted commit from a database that was replaced. Without it,
-        the database alone decides.
+        The mark is not synced: it helps to distinguish an interrupted commit from a database that was replaced.
+        Without it, the database alone decides.
         """
         raw = mark_bytes(Mark(word, tail.number, tail.sha256))
         with suppress(OSError), _locked(self.path) as descriptor:

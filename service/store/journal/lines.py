@@ -40,13 +40,13 @@ class JournalLine:
     """One line.
 
     Attributes:
-        number: from 1, as it says; 0 if it cannot be read.
+        number: the line's number from 1, as it says; 0 if it cannot be read.
         after: number of the line that the database held when this one was written; 0 for none.
-        previous_sha256: of the line before it, as it says.
-        rows: what its transaction changed.
-        continued: whether the next line belongs to the same transaction.
-        earlier_events: of a journal's first line: how many events were recorded before there was a journal.
-        sha256: of its bytes.
+        previous_sha256: hash of the line before it, as it says.
+        rows: the rows that its transaction changed.
+        continued: true if the next line belongs to the same transaction.
+        earlier_events: number of events that were recorded before there was a journal; only in its first line.
+        sha256: hash of its bytes.
         end: offset in the file after it.
         problem: why it is not as it was written, as far as it shows by itself; "" if it does not.
     """
@@ -64,7 +64,7 @@ class JournalLine:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What became of the last line's transaction."""
+    """The mark behind the last line, which says what became of its transaction."""
 
     word: Word
     number: int
@@ -73,7 +73,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """What follows the last line: a mark, nothing, or bytes that are neither, as a power cut may leave."""
+    """The end after the last line: a mark, nothing, or bytes that are neither, as a power cut may leave."""
 
     mark: Mark | None
     torn_bytes: int
@@ -81,7 +81,7 @@ class Ending:
 
 @dataclass(frozen=True, slots=True)
 class LineFields:
-    """What a line says beside its rows."""
+    """The fields of a line besides its rows."""
 
     number: int
     after: int

@@ -43,7 +43,7 @@ def key_fingerprint(public_key: bytes) -> str:
 
 
 def signed_by(checkpoint: Checkpoint, public_key: bytes) -> bool:
-    """Whether this key (32 raw bytes) made the checkpoint's signature."""
+    """Return whether this key (32 raw bytes) made the checkpoint's signature."""
     try:
         signature = base64.b64decode(checkpoint.signature, validate=True)
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, statement(checkpoint))

@@ -163,7 +163,7 @@ def _look(store: Store, run_id: str) -> Checkpoint | None:
 
 
 def _write_missing_lines(store: Store) -> None:
-    """Write the lines that the log lacks, before anything new is signed; the site's chain says how many they are.
+    """Write the lines that the log misses before anything new is signed; the site's chain says how many they are.
 
     An interrupted signature leaves lines missing, and so does somebody who cuts the log. Raises StoreError.
     """

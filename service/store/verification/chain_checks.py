@@ -61,7 +61,7 @@ class FileState:
 
 @dataclass
 class ChainFacts:
-    """What other checks need from a chain, collected in one pass over its events."""
+    """The facts of a chain that other checks need, collected in one pass over its events."""
 
     sha256_at: dict[int, str] = field(default_factory=dict[int, str])
     jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # seq → payload about a job
@@ -287,7 +287,7 @@ def _end_faults(
 
 
 def _same_moment(one_utc: str, other_utc: str) -> bool:
-    """Whether two times agree to a few seconds; older versions read the clock twice."""
+    """Return whether two times agree to a few seconds; older versions read the clock twice."""
     try:
         apart = datetime.fromisoformat(one_utc) - datetime.fromisoformat(other_utc)
     except (ValueError, TypeError):

@@ -88,7 +88,7 @@ def read_evidence(connection: Connection, run_id: str | None) -> EvidenceRows:
 
 
 def database_damage(connection: Connection) -> tuple[str, ...]:
-    """What SQLite's own check of the database finds, in words; empty if it is sound."""
+    """Return the messages of SQLite's own check of the database; empty if it is sound."""
     found = connection.execute(text("PRAGMA integrity_check(5)")).scalars()
     return tuple(f"SQLite finds the database damaged: {line}" for line in found if line != "ok")
 

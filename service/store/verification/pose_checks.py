@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ReportedPose:
-    """What a viewpoint_captured event holds of a view's place: its name, and where the controller had the arm."""
+    """A view's place as a viewpoint_captured event holds it: its name, and where the controller had the arm."""
 
     step: str
     viewpoint: str

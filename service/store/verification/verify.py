@@ -33,7 +33,7 @@ from service.store.verification.search_checks import word_faults
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What was checked and what is wrong. `ok` means no faults; notes are not faults.
+    """A list of what was checked and of what is wrong. `ok` means no faults; notes are not faults.
 
     The site's chain is always checked too, because it holds the keys; the counts are of `runs` only.
     """
@@ -55,7 +55,7 @@ class AuditReport:
 
     @property
     def ok(self) -> bool:
-        """Whether the evidence verifies."""
+        """True if the evidence verifies."""
         return not self.faults
 
     @property
@@ -98,7 +98,7 @@ def verify(
         progress: called with the number of bytes hashed.
         certificates: PEM file of the time-stamp authorities. Without it, only the stamped content is checked.
         files: False skips the files; a note says so.
-        signatures_copy: a copy of the log of signatures, kept elsewhere, which shows whether the log was cut.
+        signatures_copy: a copy of the log of signatures from elsewhere, which shows whether the log was cut.
 
     Raises:
         UnknownRunError: there is no such run.
@@ -192,7 +192,7 @@ def _log_findings(
     keys: signatures.Keys,
     run_id: str | None,
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes of the log of signatures that is kept beside the database."""
+    """Return faults and notes of the log of signatures that lies beside the database."""
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
     faults, notes = log_findings(lines, evidence.checkpoints, public_keys, awaited=bool(site.key_changes))
     before, said = written_again_findings(site.written_again, run_id)
@@ -220,7 +220,7 @@ def _check_chains(
 
 @dataclass(frozen=True, slots=True)
 class _SignatureCheck:
-    """What the signatures and time stamps of every chain are checked against."""
+    """The data against which the signatures and time stamps of every chain are checked."""
 
     evidence: EvidenceRows
     site: ChainFacts

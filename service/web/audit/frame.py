@@ -39,7 +39,7 @@ _TABS = (
 
 @dataclass
 class AuditState:
-    """What is computed for one data folder."""
+    """The background computations for one data folder."""
 
     site: Site
     digests: IncrementalResults[Digest]

@@ -111,18 +111,18 @@ _READ = [Depends(requires("read"))]
 
 @dataclass(frozen=True, slots=True)
 class _Recorded:
-    """What the first page reads from the run's events and from the index of them.
+    """The data that the first page reads from the run's events and from the index of them.
 
     Attributes:
-        root: first event of the run, None if it is missing.
+        root: first event of the run; None if it is missing.
         corrected: number of corrections.
-        devices: as they were opened.
+        devices: the devices' identities, as they were opened.
         session: last start of the program that drove the run.
         sessions: number of starts.
         exports: events of exports.
-        signatures: of steps, and of the run's release.
+        signatures: the signatures of steps, and of the run's release.
         failures: number of failed exposures of each step.
-        bodies: of the cameras.
+        bodies: the bodies of the cameras.
     """
 
     root: EventRow | None

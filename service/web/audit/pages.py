@@ -251,7 +251,7 @@ def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
     "/audit/runs/{run_id}/verification", name="audit_verification", dependencies=_READ, response_class=HTMLResponse
 )
 def verification_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """What the last verification found, or how far the current one is."""
+    """Show what the last verification found, or how far the current one is."""
     return render(request, "audit/verification.html.j2", audit=audit_frame(audit, run_id, "/verification"))
 
 

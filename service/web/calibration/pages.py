@@ -42,18 +42,18 @@ router = APIRouter(tags=["calibration"])
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPage:
-    """What the page of a calibration shows.
+    """The data that the page of a calibration shows.
 
     Attributes:
-        run_id: of the run.
+        run_id: the run's identifier.
         found: the calibration in force.
-        charts: of the intrinsics; None if they are not solved.
-        hand_eye_chart: None without a hand-eye calibration.
-        images: of the board, with their residuals.
+        charts: the charts of the intrinsics; None if they are not solved.
+        hand_eye_chart: the chart of the hand-eye calibration; None without one.
+        images: the images of the board, with their residuals.
         held_out: median and maximum error of the board's position by images that were not used, mm.
         depends: acceptances on which the calibration depends.
         regions: parts of the image without corners: name, empty cells, all cells.
-        poses: of the board that would help most.
+        poses: the poses of the board that would help most.
         further: cameras of the rig that are calibrated by themselves.
     """
 
@@ -71,7 +71,7 @@ class CalibrationPage:
 
 @dataclass(frozen=True, slots=True)
 class CertificatePage:
-    """What the certificate shows; its fields are those of CalibrationPage, and `head`, the last event of the run."""
+    """The data that the certificate shows: fields of CalibrationPage, and `head`, the last event of the run."""
 
     run_id: str
     found: Calibration
@@ -84,7 +84,7 @@ class CertificatePage:
 
 @router.get("/runs/{run_id}/calibration", name="calibration", dependencies=[Depends(requires("read"))])
 def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
-    """Whether the calibration is good, in pixels and in millimetres, and what would make it better."""
+    """Show whether the calibration is good, in pixels and in millimetres, and what would make it better."""
     log = site.run(run_id)
     found = calibration_of(log)
     frame = run_frame(site, run_id)

@@ -44,13 +44,13 @@ class Calibration:
 
     Attributes:
         steps: those that solved something, in order.
-        camera: with its distortion.
-        intrinsics: what is known about the camera besides its parameters; None: not solved yet.
-        hand_eye: None: not solved yet.
+        camera: the camera with its distortion.
+        intrinsics: the rest that is known about the camera besides its parameters; None: not solved yet.
+        hand_eye: the hand-eye calibration; None: not solved yet.
         best: the answer that the registration uses: with the arm's correction where there is one.
         captures: the board images, of the step whose images were used.
         artefact: calibration.json of the last step.
-        states: of all steps of the run.
+        states: the states of all steps of the run.
     """
 
     steps: tuple[tuple[Step, StepState], ...]
@@ -224,7 +224,7 @@ def _limit(calibration: Calibration, measure: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class StepSignature:
-    """Who signed a calibration step, when, and with which meaning."""
+    """The signature of a calibration step: who signed, when, and with which meaning."""
 
     step: str
     who: str
@@ -243,13 +243,13 @@ class LaterCheck:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What a certificate states in addition to the figures.
+    """The statements of a certificate in addition to the figures.
 
     Attributes:
         camera: EXIF of the first board image: settings, lens, body.
         robots: name in the rig, model and serial number of each whose flange carried the camera.
         passed: number, hash and time of the event by which the last step passed; None: it has not.
-        checks: of later images.
+        checks: the checks of later images.
         stops: troubles of the robot or camera since.
     """
 

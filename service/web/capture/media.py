@@ -103,14 +103,14 @@ def run_file(
 
 
 class ImageQuery(BaseModel):
-    """Which image of a viewpoint to show, and how.
+    """The query for an image of a viewpoint, and for how to show it.
 
     Attributes:
-        step: that took it; "" for the last step that has it.
-        attempt: of the step; None for the valid image.
+        step: the step that took it; "" for the last step that has it.
+        attempt: attempt of the step; None for the valid image.
         seq: event of the image; None for the valid image.
         width: wanted width in pixels; the copy has the nearest width on offer.
-        marked: whether outlines of the spheres are drawn over it.
+        marked: true if outlines of the spheres are drawn over it.
         device: a further camera, whose image is shown; "" for the first one.
     """
 
@@ -186,7 +186,7 @@ def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max
 
 
 def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
-    """What this run has recorded about a file. HTTP 404 if this run has not recorded it, even if another run has."""
+    """Return this run's record of a file, or raise HTTP 404 if it has none, even if another run has one."""
     with site.store.database.reading() as connection:
         row = connection.execute(
             select(artefacts)
@@ -209,7 +209,7 @@ def mark_source(log: RunRecord, capture: Capture, device: str = "") -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Marks:
-    """What is drawn over an image; `source` changes with it, and is "" for nothing."""
+    """The marks that are drawn over an image; `source` changes with them, and is "" for none."""
 
     log: RunRecord
     capture: Capture

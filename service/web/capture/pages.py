@@ -35,7 +35,7 @@ LISTED = 200  # viewpoints on one page of the table
 
 
 class CaptureQuery(BaseModel):
-    """Which step and which of its images to show; the page chooses what is not given."""
+    """The query for a step and for its images to show; the page chooses what is not given."""
 
     step: str = Field("", max_length=64)
     viewpoint: str = Field("", max_length=64)
@@ -85,23 +85,23 @@ class ChosenImage:
 
 @dataclass(frozen=True, slots=True)
 class StepImages:
-    """Everything about the images of one step.
+    """The images of one step, and everything that the page shows about them.
 
     Attributes:
-        run_id: of the run.
-        step: whose images they are.
-        table: of its viewpoints.
-        sheet: of its images.
+        run_id: the run's identifier.
+        step: the step whose images they are.
+        table: the table of its viewpoints.
+        sheet: the contact sheet of its images.
         image: the large one.
         drawings: the viewpoints from above, one drawing a station.
         view: the chosen viewpoint.
-        redo: whether it may be redone; None without a chosen viewpoint.
+        redo: the answer to whether it may be redone; None without a chosen viewpoint.
         in_control: the person's screen has control of the run.
         advice, suggestions: what the images lack, and the views that would help most.
         following: the page shows the newest image.
-        query: what the page was asked for.
+        query: the query of the page.
         tail: the same as the query of an address, for the parts of the page.
-        words, tones: of the states of viewpoints.
+        words, tones: labels and tones of the states of viewpoints.
         reasons: presets for a redo.
         csrf: token of the forms.
     """
@@ -128,7 +128,7 @@ class StepImages:
 
 @dataclass(frozen=True, slots=True)
 class CapturePage:
-    """What the page shows."""
+    """The data that the page shows."""
 
     run_id: str
     log: RunRecord
@@ -291,6 +291,6 @@ def _drawings(log: RunRecord, views: Sequence[StepViewpoint], name: str) -> list
 
 
 def _is_problem(capture: Capture, use: BoardUse | None) -> bool:
-    """Whether something is wrong with an image that has not been replaced."""
+    """Return whether something is wrong with an image that has not been replaced."""
     wrong = use.used is False if use is not None else not all(capture.payload.verdicts.values())
     return wrong and capture.replaced is None

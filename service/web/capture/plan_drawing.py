@@ -40,7 +40,7 @@ class PlanDrawing:
     Attributes:
         specimen: left, top, width, height.
         bar: length of 100 mm.
-        robot: where its base stands; None when it is outside of the drawing (below it).
+        robot: the place of its base; None when it is outside of the drawing (below it).
     """
 
     station: str
@@ -96,7 +96,7 @@ def plan_drawing(station: StationPlan, views: Sequence[StepViewpoint], chosen: s
 
 
 def _apart(symbols: Sequence[Symbol], chosen: str) -> list[Symbol]:
-    """One of the viewpoints that would overlap; the chosen and the next viewpoint are always kept."""
+    """Return one of the viewpoints that would overlap each other, and always the chosen and the next viewpoint."""
     wanted = [symbol for symbol in symbols if symbol.name == chosen or symbol.state == "next"]
     kept: dict[tuple[int, int], Symbol] = {}
     for symbol in sorted(symbols, key=lambda s: _FIRST.index(s.state)):

@@ -91,7 +91,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class ViewpointRedo:
-    """Whether a viewpoint may be redone now, from where the run is, and whether the robot drives there at once."""
+    """The possibility to redo a viewpoint now, from where the run is, and whether the robot drives there at once."""
 
     refused: str
     current: str  # step
@@ -191,7 +191,7 @@ def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[C
 
 
 def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
-    """Whether the calibration uses an image of the board."""
+    """Return the verdict on whether the calibration uses an image of the board."""
     use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
     answer = calibration_in(log.state.steps[step.id])
     intrinsics = None if answer is None else answer.details.intrinsics
@@ -204,7 +204,7 @@ def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
 def looked_at(
     live: JobState | None, others: Sequence[JobState | None], fewest: int = FEWEST_SPHERES
 ) -> list[Verdict]:
-    """What the job says that looked at an image; `others`: those of the same camera's images."""
+    """List what the job that looked at an image says; `others` are the jobs of the same camera's images."""
     measures = {} if live is None else dict(live.measures)
     waiting = live is not None and live.status == "enqueued"
     unknown = "being looked at" if waiting else "not measured"
@@ -240,7 +240,7 @@ def looked_at(
 
 
 def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
-    """What was judged when the image was taken."""
+    """List the verdicts on an image when it was taken."""
     payload = capture.payload
     out: list[Verdict] = []
     if isinstance(payload, ViewpointCaptured):
@@ -262,7 +262,7 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
 
 
 def settings_verdict(camera: StatedCamera, passed: bool | None, limit: str = "") -> Verdict:
-    """Whether a photograph was taken with the settings that it should have."""
+    """Return the verdict on whether a photograph was taken with the settings that it should have."""
     words = {None: "not judged", True: "As wanted", False: "Differ"}
     figures = _settings(camera.aperture_f, camera.exposure_s, camera.iso)
     return Verdict("Settings", passed, words[passed], figures, limit)
@@ -284,7 +284,7 @@ def _settings(aperture_f: float | None, exposure_s: float | None, iso: float | N
 
 
 def summary_of(step: Step, capture: Capture) -> list[Verdict]:
-    """What all images up to this one come to, against the step's gates where it has any."""
+    """List what all images up to this one come to, against the step's gates where it has any."""
     measures = {} if capture.live is None else dict(capture.live.measures)
     out: list[Verdict] = []
     for measure, name, unit, factor, digits in (
@@ -307,7 +307,7 @@ def summary_of(step: Step, capture: Capture) -> list[Verdict]:
 
 
 def redo_of(log: RunRecord, step: Step, view: StepViewpoint, account: str) -> ViewpointRedo:
-    """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
+    """Return whether a viewpoint may be redone now. While the step runs, the robot then drives there by itself."""
     action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
     refusal = refuse(log.protocol, log.state, action, account)
     return ViewpointRedo(
@@ -340,10 +340,10 @@ class CameraImage:
 
     Attributes:
         device: name of a further camera in rig.yaml; "" for the first one.
-        place: where the camera is, in words.
-        sha256: of the photograph.
-        width, height: of the photograph as it states them.
-        verdicts: of this image.
+        place: a text on where the camera is.
+        sha256: hash of the photograph.
+        width, height: size of the photograph as it states it, px.
+        verdicts: the verdicts on this image.
     """
 
     device: str
@@ -375,12 +375,12 @@ class SheetImage:
 def camera_images(
     log: RunRecord, capture: Capture, verdicts: Sequence[Verdict], others: Sequence[Capture]
 ) -> list[CameraImage]:
-    """The images of all cameras at the viewpoint of a capture, the first camera's first.
+    """Return the images of all cameras at the viewpoint of a capture, the first camera's first.
 
     Args:
-        log: of the run.
-        capture: of the viewpoint.
-        verdicts: of the first camera's image.
+        log: the run's record.
+        capture: the viewpoint's capture.
+        verdicts: the verdicts on the first camera's image.
         others: valid captures of the step, whose images each camera's is compared with.
     """
     size = stated_camera(capture.payload)

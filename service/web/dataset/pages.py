@@ -35,9 +35,9 @@ class Benchmark:
     """The results that belong to a run: those on one of the data sets that it has exported.
 
     Attributes:
-        results: by method, dense before sparse.
+        results: the results by method, dense before sparse.
         best: smallest Chamfer distance of each scenario, mm.
-        problem: why they cannot be read; "".
+        problem: why they cannot be read; "" if they can.
     """
 
     results: tuple[BenchmarkResult, ...]
@@ -75,7 +75,7 @@ class Previews:
         self._children = ChildProcesses("service.web.dataset.process", "preview", clock)
 
     def ready(self, state: RunState) -> Preview | None:
-        """What is ready of a completed run's preview. Begins to make it where nobody has; None: nothing is ready."""
+        """Return what is ready of a completed run's preview, None if nothing is; start to make it if nobody did."""
         found = read_preview(self._folder(state))
         if (found is None or not found.whole) and self._children.state(state.run_id) is None:
             self.make(state)
@@ -136,18 +136,18 @@ class SplitTab:
 
 @dataclass(frozen=True, slots=True)
 class DataSetView:
-    """The page.
+    """The data that the page shows.
 
     Attributes:
-        views: of the chosen split.
+        views: the views of the chosen split.
         split: the chosen one.
-        splits: all.
+        splits: all splits.
         chosen: the view that is enlarged; None: there is none yet.
         before, after: names of its neighbours in the split; "" at the ends.
         done: views whose pictures are ready.
-        total: of all views.
-        crops: of the views of the split.
-        covered: (at least so many views, share of the surface).
+        total: number of all views.
+        crops: number of crops of the views of the split.
+        covered: pairs (number of views, share of the surface that at least so many views see).
     """
 
     views: tuple[ViewPreview, ...]

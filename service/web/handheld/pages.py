@@ -31,7 +31,7 @@ Parts = Annotated[str, part_names("way", "image", "plan", "overlay")]
 
 @dataclass(frozen=True, slots=True)
 class HandheldPage:
-    """What the page shows; `step` and `now` are None in a protocol without images by hand."""
+    """The data that the page shows; `step` and `now` are None in a protocol without images by hand."""
 
     run_id: str
     log: RunRecord

@@ -44,7 +44,7 @@ class PlanMarker:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Over the live view, in a frame of 150 × 100: which way the camera goes in the picture, and nearer or away."""
+    """The marks over the live view, in a frame of 150 × 100: the camera's way in the picture, and nearer or away."""
 
     arrow: tuple[float, float] | None  # tip, from the middle
     nearer_m: float  # positive: towards the scene

@@ -63,12 +63,12 @@ class TimeChart:
 def time_chart(
     points: Sequence[TimePoint], *, title: str, unit: str, from_zero: bool = True, limit: float | None = None
 ) -> TimeChart | None:
-    """A chart of points in order of time; None if there are no points.
+    """Return a chart of points in order of time; None if there are no points.
 
     Args:
-        points: oldest first.
-        title: of the chart.
-        unit: of the values.
+        points: the points, oldest first.
+        title: the chart's title.
+        unit: the values' unit.
         from_zero: the axis begins at zero; otherwise it spans the values.
         limit: the largest value that the protocol allows; None if it sets no limit.
     """
@@ -132,7 +132,7 @@ def _range(values: Sequence[float], limit: float | None, *, from_zero: bool) -> 
 
 
 def _days(first: float, last: float) -> list[tuple[float, str]]:
-    """Up to five times on whole hours, days, or multiples of them, in UTC."""
+    """Return up to five times on whole hours, days, or multiples of them, in UTC."""
     steps = (
         900.0,
         3600.0,

@@ -232,7 +232,7 @@ def start_form(
 
 
 def _known(earlier: list[RunAbout], field: str) -> list[str]:
-    """What was entered before, newest first, each once."""
+    """Return what was entered before, newest first, each once."""
     return list(dict.fromkeys(value for about in earlier if (value := str(getattr(about, field)))))[:_KNOWN]
 
 

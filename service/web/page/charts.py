@@ -47,7 +47,7 @@ class HeatMap:
 
 @dataclass(frozen=True, slots=True)
 class Arrow:
-    """From one place to another."""
+    """An arrow from one place to another."""
 
     x1: float
     y1: float
@@ -79,7 +79,7 @@ class ChartPoint:
 
 @dataclass(frozen=True, slots=True)
 class DotPlot:
-    """Values of several series for each name, along the x axis; told apart by shape."""
+    """Values of several series for each name, along the x axis; the series differ in shape."""
 
     title: str
     height: float
@@ -101,12 +101,12 @@ def heat_map(
     logarithmic: bool = False,
     every: int = 1,
 ) -> HeatMap:
-    """Values (rows, columns) over an image of a width and height in pixels.
+    """Draw values (rows, columns) over an image of a width and height in pixels.
 
     Args:
-        digits: after the point of the numbers in the cells.
+        digits: digits after the point of the numbers in the cells.
         logarithmic: shades go by the logarithm; for values above zero that span decades.
-        every: the number of every so many-th cell is written.
+        every: write the number in one of this many cells, along rows and columns.
     """
     rows, columns = len(values), len(values[0])
     width = WIDTH - _LEFT - _RIGHT

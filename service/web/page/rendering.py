@@ -63,7 +63,7 @@ def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
 
 
 def entered_of(root: EventRow) -> list[tuple[str, str]]:
-    """What was entered when a run began, read from its first event in the database."""
+    """Return what was entered when a run began, from its first event in the database."""
     try:
         return about_rows(RunAbout.model_validate(root.payload.get("about") or {}))
     except ValidationError:  # altered: the verification says so
@@ -84,13 +84,13 @@ def part_names(*names: str) -> Any:
 def render(
     request: Request, template: str, shown: DataclassInstance | None = None, /, *, status: int = 200, **more: object
 ) -> HTMLResponse:
-    """A page, or a part of one.
+    """Render a page, or a part of one.
 
     Args:
-        request: whose `person` is who is signed in, or None on the few public pages.
-        template: `run/run.html.j2` is service/web/run/templates/run.html.j2.
+        request: the request; its `person` is who is signed in, or None on the few public pages.
+        template: the template's path; `run/run.html.j2` is service/web/run/templates/run.html.j2.
         shown: record of what the page shows; the template has its fields as variables.
-        status: of the response.
+        status: the status of the response.
         more: further variables of the template.
     """
     own: Mapping[str, object] = {} if shown is None else {f.name: getattr(shown, f.name) for f in fields(shown)}
@@ -161,7 +161,7 @@ def install_errors(app: FastAPI) -> None:
 
 
 def wants_json(request: Request) -> bool:
-    """Whether the client reads JSON rather than pages."""
+    """Return whether the client reads JSON rather than pages."""
     accepted = request.headers.get("accept", "")
     return "application/json" in accepted and "text/html" not in accepted
 
@@ -177,7 +177,7 @@ def respond(request: Request, problem: PageProblem, headers: dict[str, str] | No
 
 
 def _recognise(request: Request) -> None:
-    """Who looks at the page of an error that came before any guard, such as an address that does not exist."""
+    """Recognise who looks at the page of an error that came before any guard, such as an unknown address."""
     site = request.app.state.site
     if hasattr(request.state, "person"):
         return

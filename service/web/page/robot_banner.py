@@ -51,14 +51,14 @@ LOST = Banner(
 
 
 def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, driven: bool, tries: str = "") -> Banner:
-    """What to say of the robot; what is not known for certain is shown as unknown.
+    """Return what to say of the robot; what is not known for certain is shown as unknown.
 
     Args:
-        state: of the run.
-        snapshot: the last word of the program that drives it.
+        state: the run's state.
+        snapshot: the last report of the program that drives it.
         now_utc_s: now, in seconds since the epoch.
-        driven: whether that program runs.
-        tries: what failed and is tried again by itself, in words; "" for nothing.
+        driven: true if that program runs.
+        tries: a text on what failed and is tried again by itself; "" for nothing.
     """
     lost = lost_arms(state)
     banner = _present(state, snapshot, now_utc_s, tries, driven=driven)
@@ -84,7 +84,7 @@ def _ended(state: RunState) -> str:
 
 
 def _now(snapshot: Snapshot) -> str:
-    """What the program does now, if it takes long."""
+    """Return what the program does now, if it takes long."""
     busy = busy_words(snapshot)
     return f"Now: {busy}." if busy else ""
 
@@ -101,7 +101,7 @@ def _loss_words(name: str, loss: Loss) -> str:
 def _present(  # noqa: PLR0911 - one return a case
     state: RunState, snapshot: Snapshot, now_utc_s: float, tries: str, *, driven: bool
 ) -> Banner:
-    """What to say of the robot as if every loss of a connection had been seen to."""
+    """Return what to say of the robot as if every loss of a connection had been seen to."""
     if snapshot.doing in ("unknown", "ended") and not driven and connected_arms(state) and _left(state, snapshot):
         return _left_alone(state, snapshot)
     if state.terminal:
@@ -154,7 +154,7 @@ def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
 
 
 def _left(state: RunState, snapshot: Snapshot) -> bool:
-    """Whether the program that drove the run ended without closing its connections in an orderly way at the end."""
+    """Return whether the program that drove the run ended without closing its connections in an orderly way."""
     return not state.terminal or (snapshot.doing == "unknown" and snapshot.at_utc_s > 0)
 
 
@@ -172,7 +172,7 @@ def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
 
 
 def busy_words(snapshot: Snapshot) -> str:
-    """What the program is doing, and for how long; "" if it does not take long.
+    """Return what the program is doing, and for how long; "" if it does not take long.
 
     A call without a description of its own is described by the work it belongs to, so that a hang is visible.
     """

@@ -1,4 +1,4 @@
-"""The frame of every page of a run: its name and navigation, how it stands, and the words that pages share."""
+"""The frame of every page of a run: its name and navigation, how it stands, and the texts that pages share."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def count(amount: int, one: str, many: str = "") -> str:
 
 
 def will_happen(step: Step, now: StepState) -> tuple[str, str]:
-    """What a confirmation of this step does: the large words of its button, and a line below."""
+    """Return what a confirmation of this step does: the large text of its button, and a line below."""
     kind = step_kinds().get(step.kind)
     left = max(planned_views(step) - len(now.captured), 0)
     before = BeforeStep(step.title, left, station_of(step))
@@ -81,7 +81,7 @@ def figure_line(verdict: GateVerdict) -> str:
 
 
 def needs(verdict: GateVerdict) -> str:
-    """What a gate lacks: `Coverage 0.896, needs at least 0.9`."""
+    """Return what a gate needs: `Coverage 0.896, needs at least 0.9`."""
     allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)
     undecided = ", not decided" if verdict.undecided else ""
     return f"{measure_name(verdict.measure)} {figure(verdict)}, needs {allowed}{undecided}"
@@ -145,17 +145,17 @@ Mode = Literal["ask", "sign", "more", "recover", "work", "paused", "died", "ende
 
 @dataclass(frozen=True, slots=True)
 class RunStanding:
-    """How a run stands now.
+    """The present standing of a run.
 
     Attributes:
-        mode: what it does or waits for.
-        decision: what the machine would do next.
-        key: the same for a tower, and for screens that are told of other runs.
-        word: in one or two words.
-        tone: of that word.
-        why: what stops it or is asked for, without a full stop; "" for nothing.
-        alert: what a screen that looks elsewhere is told; "" while it works.
-        headline: what a screen that looks at it is told.
+        mode: the thing that it does or waits for.
+        decision: the decision of what the machine would do next.
+        key: the same for a light tower, and for screens that show other runs.
+        word: the standing in one or two words.
+        tone: the tone of that word.
+        why: the thing that stops it or is asked for, without a full stop; "" for nothing.
+        alert: the message for a screen that looks elsewhere; "" while it works.
+        headline: the message for a screen that looks at it.
     """
 
     mode: Mode
@@ -171,13 +171,13 @@ class RunStanding:
 def run_standing(
     protocol: Protocol, state: RunState, *, driven: bool, robot: RobotPhase = "not_connected"
 ) -> RunStanding:
-    """How a run stands, from its record alone and from who drives it; so a dead runner is noticed too.
+    """Return how a run stands, from its record alone and from who drives it; so a dead runner is noticed too.
 
     Args:
-        protocol: of the run.
-        state: of the run.
-        driven: whether a running process drives it.
-        robot: as its driver last told.
+        protocol: the run's protocol.
+        state: the run's state.
+        driven: true if a running process drives it.
+        robot: the robot's phase, as its driver last reported it.
     """
     decision, title = decide(protocol, state), protocol.step(state.current).title
     if state.terminal:
@@ -227,7 +227,7 @@ def _driven(protocol: Protocol, state: RunState, decision: Decision, title: str)
 
 @dataclass(frozen=True, slots=True)
 class Attention:
-    """What a screen reports by sound and notification, if alerts are switched on there."""
+    """The report of a screen by sound and notification, if alerts are switched on there."""
 
     key: Standing = "works"
     words: str = ""
@@ -244,7 +244,7 @@ class Tab:
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """What base.html.j2 needs to know about a run."""
+    """The data about a run that base.html.j2 needs."""
 
     run_id: str
     name: str

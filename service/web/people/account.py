@@ -127,7 +127,7 @@ def set_up_page(request: Request, site: CurrentSite, token: Token) -> HTMLRespon
 
 
 class SetUpForm(BaseModel):
-    """What a person chooses behind a one-time link; only the first administrator also chooses the two names."""
+    """The choices of a person behind a one-time link; only the first administrator also chooses the two names."""
 
     password: str = Field(max_length=256)
     repeated: str = Field(max_length=256)

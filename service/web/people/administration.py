@@ -211,7 +211,7 @@ _ENROL = [Depends(requires("enrol"))]
 
 @router.get("/badges", name="badges", dependencies=_ENROL, response_class=HTMLResponse)
 def badges(request: Request, site: CurrentSite) -> HTMLResponse:
-    """Who has a badge."""
+    """Show who has a badge."""
     return _badges_page(request, site)
 
 

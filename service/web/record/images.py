@@ -52,7 +52,7 @@ class StatedCamera(BaseModel):
 
 
 def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
-    """What the photograph of a view states about the camera."""
+    """Return what the photograph of a view states about the camera."""
     return StatedCamera.model_validate(view.camera)
 
 
@@ -72,7 +72,7 @@ class Capture:
     """One exposure in the record.
 
     Attributes:
-        replaced: by what and why, where it is no longer valid.
+        replaced: the reason and the thing that replaced it, where it is no longer valid.
         live: the job that looked at the image while the capture ran; None where there is none.
     """
 
@@ -182,7 +182,7 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
 
 
 def replaced_events(log: RunRecord) -> Mapping[int, Superseded]:
-    """What replaced an exposure, by the number of its event."""
+    """Return what replaced an exposure, by the number of its event."""
     return {seq: past for past in log.state.superseded for seq in past.captured.values()}
 
 
@@ -204,7 +204,7 @@ _SEARCH = re.compile(r" ?\(searched at widths [^)]*\)")  # what the detector onc
 
 @dataclass(frozen=True, slots=True)
 class BoardUse:
-    """Whether one board image is used; `used` is None while that is not known."""
+    """The use of one board image; `used` is None while that is not known."""
 
     used: bool | None
     word: str
@@ -228,12 +228,12 @@ def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str
 
 
 def calibration_in(state: StepState) -> calibrate.Answer | None:
-    """What a step has calibrated; None if its result is not there yet, or of another kind, as of imported images."""
+    """Return a step's calibration; None if it has no result yet, or one of another kind, as imported images do."""
     return calibrate.KIND.read_answer(state.result) if "camera" in state.result else None
 
 
 def board_use(state: StepState, view: RecordedView) -> BoardUse:
-    """Whether one image of a step is used."""
+    """Return whether one image of a step is used, and why."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
     looks = [job for job in state.jobs.values() if job.kind == board_view.KIND.name]
     look = next((job for job in looks if image_of(job).sha256 == sha256), None)
@@ -286,7 +286,7 @@ def _plain(reason: str) -> str:
 
 
 def recorded_rig_section(log: RunRecord) -> RigSection:
-    """What the rig file of the run says. Raises ConfigurationError if this version cannot read it."""
+    """Return what the rig file of the run says. Raises ConfigurationError if this version cannot read it."""
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the record was read
     return _section(log.store.artefact_path(root.rig.sha256))

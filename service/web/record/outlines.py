@@ -84,7 +84,7 @@ def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
 
 
 def _found_in(log: RunRecord, step: str) -> SpheresFound:
-    """What a step that imports a scan or a CT found; no spheres without such a step, or before it has a result."""
+    """Return the spheres that an import of a scan or a CT found; none without such a step, or before its result."""
     result = log.state.steps[step].result if step in log.state.steps else {}
     return locate_spheres.KIND.read_answer(result) if result else SpheresFound(spheres_m=())
 
@@ -104,7 +104,7 @@ _OUTLINES_BY_VIEWPOINT = TypeAdapter(dict[str, tuple[OutlineRecord, ...]])
 
 
 class LivePose(BaseModel):
-    """Where an image was taken, as the job `live_view` found it; T_base_scan is None while it is not known."""
+    """The place where an image was taken, as the job `live_view` found it; T_base_scan is None until it is known."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -144,7 +144,7 @@ class OutlineSource:
     Attributes:
         source: version of the outlines, which changes with what would be drawn.
         artefact: file with the outlines.
-        T_camera_scan: of the frame of `spheres`; None while it is not known.
+        T_camera_scan: the pose of the frame of `spheres`; None while it is not known.
         live: the artefact is a file of the job `live_view`, which holds one image; others hold all, by viewpoint.
     """
 

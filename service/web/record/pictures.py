@@ -1,4 +1,4 @@
-"""Small copies of large photographs, kept in DIR/cache: made once, replaced as a whole, never evidence."""
+"""Small copies of large photographs in DIR/cache: made once, replaced as a whole, never evidence."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class DrawnOutline:
     """The outline of one sphere in one image.
 
     Attributes:
-        kind: what it is of.
-        label: written into it.
+        kind: the kind of thing whose outline it is.
+        label: the text that is written into it.
         outline_px: (L, 2) points in pixels of the image as captured.
     """
 

@@ -48,7 +48,7 @@ Reason = Annotated[str, Form(max_length=REASON_CHARACTERS)]
 
 
 class StartForm(BaseModel):
-    """What a run is begun with: a protocol file, and what people enter about the run, of which it needs the specimen.
+    """The form that starts a run: a protocol file, and what people enter about the run, which must name the specimen.
 
     A protocol whose content was changed without a new version also needs a reason and a password.
     """
@@ -70,16 +70,16 @@ class ActionForm(BaseModel):
         verb: the action.
         step: identifier of the step; "" for the current one.
         current: the step at which the run was, as the page showed it; a redo is of another one.
-        attempt: of that step, as the page showed it.
-        viewpoint: that is redone; "" for the whole step.
+        attempt: the attempt of that step, as the page showed it.
+        viewpoint: the viewpoint that is redone; "" for the whole step.
         replaces: number of the event whose image of the viewpoint the page said is replaced; 0 for none.
-        moves: whether the page said that the robot then drives there at once.
+        moves: true if the page said that the robot then drives there at once.
         preset: a reason chosen from the list.
-        reason: words that are added to it.
-        meaning: what a signature stands for.
-        known_by: what `password` holds: the password, or a PIN or badge where the site allows them for signatures.
+        reason: text that is added to it.
+        meaning: the meaning of a signature.
+        known_by: the kind of secret in `password`: a password, or a PIN or badge where the site allows them to sign.
         password: see `known_by`.
-        account: of the person who accepts, where that is not the person who is signed in.
+        account: the account of the person who accepts, where that is not the person who is signed in.
         signed_sha256: hash of the record that a signature or acceptance binds.
         seen_seq: number of the last event that the page showed.
         back: page to return to; "" for the run's page.

@@ -141,7 +141,7 @@ async def _news(request: Request, site: Site, screen: str, run_id: str) -> Async
 
 
 def _signed_in(site: Site, token: str) -> Person | None:
-    """Who sits there; a screen that was left alone is locked by this look."""
+    """Return who sits there; a screen that was left alone is locked by this look."""
     return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
 
 
@@ -158,7 +158,7 @@ def newest(site: Site, run_id: str) -> tuple[int, int]:
 
 
 def _ages(site: Site, run_id: str) -> list[str]:
-    """What the pages say of a coat's age; nothing of a run that cannot be read, which its pages say themselves."""
+    """Return what the pages say of a coat's age; nothing of an unreadable run, as its pages say so themselves."""
     try:
         return [coat.title for coat in coats_of(site, site.run(run_id))]
     except OrthocaptureError:
@@ -172,25 +172,25 @@ _DRAWINGS = files("service.web.run") / "drawings"
 
 @dataclass(frozen=True, slots=True)
 class RunPage:
-    """What the page shows.
+    """The data that the page shows.
 
     Attributes:
         view: the run and the step on the screen.
         acceptors: accounts that may accept the question's figures.
         looking_back: the step on the screen is not the current one.
-        dialog: the one that is open without script; "" for none.
+        dialog: the dialog that is open without script; "" for none.
         notes: people's notes on the step, or on the whole run once it has ended.
-        about: what was entered when the run began: name and text.
-        reasons: presets of the protocol.
-        signing: what may stand for a password.
-        drawing: beside the instructions.
-        lens_step: the live view belongs to this step.
+        about: the name and text of each thing that was entered when the run began.
+        reasons: the protocol's presets of reasons.
+        signing: the secrets that may stand for a password.
+        drawing: the drawing beside the instructions.
+        lens_step: true if the live view belongs to this step.
         board_plan: version of the plan of the step's board images; 0 for other steps.
         now_utc: time of the page.
         depends: acceptances on which the run's results depend.
         result_table: rows of the evaluation.
-        result_note: what some of these rows share.
-        further_cameras: of the rig, for the live view.
+        result_note: a note on what some of these rows share.
+        further_cameras: the rig's further cameras, for the live view.
     """
 
     view: RunView
@@ -269,14 +269,14 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
 
 
 def _aims(view: RunView) -> bool:
-    """Whether a person focuses or aims the camera now: the live view belongs there."""
+    """Return whether a person focuses or aims the camera now: the live view belongs there."""
     focuses = view.shown.drawing == "camera" and view.shown.only_ticks
     aims = view.shown.drawing == "layout_photo" and view.mode in ("ask", "more")
     return view.shown.current and (focuses or aims)
 
 
 def _about(log: RunRecord) -> list[tuple[str, str]]:
-    """What was entered of the run when it began."""
+    """Return what was entered of the run when it began."""
     root = log.events[0].payload
     return about_rows(root.about) if isinstance(root, RunStarted) else []
 

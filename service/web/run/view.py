@@ -1,4 +1,4 @@
-"""What the run page shows, as plain data: a pure function of the record, the runner's last word and who looks."""
+"""What the run page shows, as plain data: a pure function of the record, the runner's last report and who looks."""
 
 from __future__ import annotations
 
@@ -70,15 +70,15 @@ def run_view(
     earlier: EarlierTimes = NOT_MEASURED,
     now_utc: str = "",
 ) -> RunView:
-    """The page of a run that has begun.
+    """Return the page of a run that has started.
 
     Args:
         log: the run's record.
         snapshot: the runner's latest report.
-        viewer: who looks at the page.
-        driven: whether a running process drives the run.
+        viewer: the person who looks at the page.
+        driven: true if a running process drives the run.
         show: step to look at; the current one if it is "" or unknown.
-        to_come: what is still being computed, in words.
+        to_come: texts on what is still being computed.
         computing: the jobs that wait or are computed, which a person may end.
         space: forecast of what the run will still write; None if it is not known.
         earlier: how long the steps took in earlier runs.

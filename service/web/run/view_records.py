@@ -137,12 +137,12 @@ def _left(each_s: float | None, views: int) -> str:
 def readings(
     snapshot: Snapshot, space: Forecast | None = None, clocks: Sequence[ClockReading] = ()
 ) -> tuple[Reading, ...]:
-    """What the runner last reported of the machine and the devices; what it did not report is shown as unknown.
+    """Return what the runner last reported of machine and devices; what it did not report is shown as unknown.
 
     Args:
-        snapshot: of the runner.
-        space: what the run will still write, where it is known.
-        clocks: as last compared; those beyond their limits are shown.
+        snapshot: the runner's snapshot.
+        space: forecast of what the run will still write, where it is known.
+        clocks: the clocks as last compared; those beyond their limits are shown.
     """
     battery = snapshot.camera_battery_fraction
     return (
@@ -201,7 +201,7 @@ class RecordOfRun(Interface):
 
 @dataclass(frozen=True, slots=True)
 class Viewer:
-    """Who looks, and how they stand to the control of this run."""
+    """The person who looks, and how they stand to the control of this run."""
 
     may_operate: bool = False
     may_sign: bool = False  # with or without control
@@ -313,7 +313,7 @@ class StepRedo:
 
 @dataclass(frozen=True, slots=True)
 class SignedContent:
-    """What a signature binds."""
+    """The content that a signature binds."""
 
     sha256: str
     title: str
@@ -346,7 +346,7 @@ class StepTrouble:
 
 @dataclass(frozen=True, slots=True)
 class StepMore:
-    """What a step asks for in its normal course before it can be judged."""
+    """The request of a step in its normal course for more, before it can be judged."""
 
     title: str
     advice: str
@@ -368,24 +368,24 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What the run asks of people now, and what they can do.
+    """The question that the run asks of people now, and what they can do.
 
     Attributes:
         main: the one large button; None if there is nothing to press.
         options: further actions.
-        can_pause: whether this person can pause the run.
+        can_pause: true if this person can pause the run.
         asked_anew: the program that drove the robot has ended, or the confirmation was too long ago, so nothing moves
             before somebody confirms again.
         lapsed: why the confirmation no longer holds; "" where the program has ended.
         standing: the run is paused and the robot is known to stand still.
-        paused: how it stands with a paused run and its robot, in words.
-        more: what the step asks for in its normal course; None for nothing, or where something went wrong.
+        paused: a text on how it stands with a paused run and its robot.
+        more: the step's request in its normal course; None for nothing, or where something went wrong.
         trouble: why the run is stopped; None if it is not.
-        ways: what can be done about that, the recommended one first.
-        signature: what is to be signed; None for nothing.
-        acceptance: what could be accepted outside its limits; None for nothing.
+        ways: the ways out of that, the recommended one first.
+        signature: the content to be signed; None for nothing.
+        acceptance: the figures that could be accepted outside their limits; None for nothing.
         redos: steps that can be done again.
-        skip_overrides: whether a skip would now override figures outside their limits.
+        skip_overrides: true if a skip would now override figures outside their limits.
     """
 
     main: MainAction | None

@@ -1,4 +1,4 @@
-"""The scene of a run as far as it is known, registered or planned, for the 3D view and in words and numbers."""
+"""The scene of a run as far as it is known, registered or planned, for the 3D view and in text and numbers."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class KnownScene:
     """A scene and what pages say about it.
 
     Attributes:
-        frame: of the positions, in words.
-        how: where the poses come from, in words.
-        missing: what is not shown, and why.
+        frame: a text on the frame of the positions.
+        how: a text on the origin of the poses.
+        missing: texts on what is not shown, and why.
         mesh: file of the surface; None: there is none yet.
-        sphere_images: by sphere's label, in how many images it was seen.
+        sphere_images: number of images in which each sphere was seen, by its label.
     """
 
     scene: Scene
@@ -255,7 +255,7 @@ def _all_captures(log: RunRecord) -> list[RecordedView]:
 
 
 def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
-    """The scene with its surface, decimated once and then kept in DIR/cache; coloured by the predicted error."""
+    """Return the scene with its surface, which is decimated once and cached; coloured by the predicted error."""
     if now.mesh is None:
         return now.scene
     points, triangles, _ = _surface(log, now.mesh, data)
