@@ -64,7 +64,7 @@ class ChildProcesses:
         self._lock = Lock()
 
     def state(self, run_id: str) -> ChildState | None:
-        """The state of the running child, or of the last one; None before the first."""
+        """Return the state of the running child, or of the last one; None before the first."""
         with self._lock:
             return self._states.get(run_id)
 
@@ -216,7 +216,7 @@ class CopyableResult(Protocol):
     """A value that can be computed step by step."""
 
     def copy(self) -> Self:
-        """A copy that can be continued while pages read this one."""
+        """Return a copy that can be continued while pages read this one."""
         ...
 
 
@@ -265,7 +265,10 @@ class IncrementalResults(Generic[T]):
         self._warm = False
 
     def get(self, run_id: str, wait_s: float = WAIT_S) -> T | PartialProgress:
-        """The value for the present events of a run, or its progress. Raises UnknownRunError, errors of `advance`."""
+        """Return the value for the present events of a run, or its progress.
+
+        Raises UnknownRunError, errors of `advance`.
+        """
         ready = self.ready(run_id)
         if not isinstance(ready, PartialProgress):
             return ready
@@ -277,7 +280,7 @@ class IncrementalResults(Generic[T]):
         return self.ready(run_id)
 
     def ready(self, run_id: str) -> T | PartialProgress:
-        """The value if it is up to date, else None; nothing is computed. Raises UnknownRunError."""
+        """Return the value if it is up to date, else None; nothing is computed. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
             last, sha256 = head(connection, run_id)
         return self.at(run_id, last, sha256)

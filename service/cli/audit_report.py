@@ -100,7 +100,10 @@ def report_command(
 
 
 def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
-    """The name of the person for whom the report is recorded. Raises ConfigurationError, SignInRefusedError."""
+    """Return the name of the person for whom the report is recorded.
+
+    Raises ConfigurationError, SignInRefusedError.
+    """
     with Store.open(data, create=False) as store:
         return acting_person(store, operator, password_stdin=password_stdin).name
 

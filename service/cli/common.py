@@ -97,7 +97,7 @@ def exit_status(error: OrthocaptureError) -> int:
 
 
 def error_record(error: OrthocaptureError) -> dict[str, str]:
-    """An error as plain data, for JSON output."""
+    """Return an error as plain data, for JSON output."""
     return {"kind": type(error).__name__, "what": error.what, "where": error.where, "remedy": error.remedy}
 
 
@@ -135,7 +135,7 @@ def reporting_errors(json: bool = False) -> Generator[None]:
 
 
 def _bug_record(error: Exception) -> dict[str, str | list[str]]:
-    """A fault of this program as plain data, with what a developer needs to find it."""
+    """Return a fault of this program as plain data, with what a developer needs to find it."""
     frames = traceback.extract_tb(error.__traceback__)
     return {
         "kind": type(error).__name__,
@@ -252,12 +252,12 @@ PROTOCOL_HELP = "The protocol file, or the name of a shipped one, such as exvivo
 
 
 def shipped_protocols() -> Path:
-    """The folder of the protocols that come with orthocapture."""
+    """Return the folder of the protocols that come with orthocapture."""
     return Path(str(files(_FOLDER)))
 
 
 def protocol_file(named: Path) -> Path:
-    """The protocol file of this path, or the shipped one of this name if there is no such file.
+    """Return the protocol file of this path, or the shipped one of this name if there is no such file.
 
     `exvivo_spine`, `exvivo_spine.yaml` and `protocols/exvivo_spine.yaml` name the same one, wherever the command is
     given. Raises ProtocolError, which lists the names, if there is neither.

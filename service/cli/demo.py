@@ -172,7 +172,7 @@ def true_error_mm(
     T_world_scan: ArrayLike,
     spheres_m: ArrayLike,
 ) -> float:
-    """The true registration error in mm at the centre of the spheres.
+    """Return the true registration error in mm at the centre of the spheres.
 
     Args:
         T_scan_camera: the registration, by viewpoint.

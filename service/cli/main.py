@@ -180,7 +180,7 @@ class _Commands(TyperGroup):
     """The group of all commands, each imported on first use."""
 
     def make_context(self, *words: Any, **options: Any) -> Any:
-        """The options before the command."""
+        """Return the options before the command."""
         with _usage_escaped():
             return super().make_context(*words, **options)
 
@@ -190,11 +190,11 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names in the order of the help text."""
+        """Return names in the order of the help text."""
         return list(_GROUP_OF)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The name and the line of a command, for help and shell completion; None if there is no such command.
+        """Return the name and the line of a command, for help and shell completion; None if there is no such command.
 
         Importing every command would take seconds. The one that was typed comes from `resolve_command`.
         """
@@ -203,7 +203,7 @@ class _Commands(TyperGroup):
         return TyperCommand(cmd_name, help=_COMMANDS[cmd_name].line, rich_help_panel=_GROUP_OF[cmd_name])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that was typed, imported; suggests a similar name if there is no such command."""
+        """Return the command that was typed, imported; suggests a similar name if there is no such command."""
         name = args[0]
         if name in _COMMANDS:
             return name, _loaded(name), args[1:]

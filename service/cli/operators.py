@@ -164,7 +164,7 @@ class _Operator:
         """Let the person who was asked put it right, however long that takes."""
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """The items that a confirmation ticks: the whole list, as the terminal says."""
+        """Return the items that a confirmation ticks: the whole list, as the terminal says."""
         return question.checklist
 
     def close(self) -> None:
@@ -188,7 +188,7 @@ class ScreenOperator(_Operator):
         return None
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """The items ticked on a screen: the pedal does no more than the button there."""
+        """Return the items ticked on a screen: the pedal does no more than the button there."""
         return state.steps[question.step].ticked
 
 
@@ -231,7 +231,10 @@ class TerminalOperator(_Operator):
         return action
 
     def _line(self) -> str | None:
-        """A complete line, or None. Not read through sys.stdin, whose buffer would hide further lines from select."""
+        """Return a complete line, or None.
+
+        Not read through sys.stdin, whose buffer would hide further lines from select.
+        """
         while b"\n" not in self._typed:
             if not select.select([self.descriptor], [], [], 0)[0]:
                 return None
@@ -349,7 +352,7 @@ def _elsewhere(protocol: Protocol, state: RunState, asked: AskOperator) -> tuple
 
 
 def _ways_lines(question: AskOperator) -> list[str]:
-    """The choices, the recommended one first, each with what to type, its time and what it loses."""
+    """Return the choices, the recommended one first, each with what to type, its time and what it loses."""
     lines = ["\nWhat can be done now, the recommended first:"] if question.ways else []
     for way in question.ways:
         if way.available:
@@ -397,7 +400,7 @@ class AutomaticOperator(_Operator):
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
-    """The part of an import that a step imports; None if it imports nothing."""
+    """Return the part of an import that a step imports; None if it imports nothing."""
     params = protocol.step(step_id).params
     match params:
         case image_import.Params():

@@ -23,7 +23,7 @@ PasswordOption = Annotated[
 
 
 def acting_person(store: Store, operator: str, *, password_stdin: bool) -> Identity:
-    """The person who acts at this terminal: the given name, or that of the machine's user.
+    """Return the person who acts at this terminal: the given name, or that of the machine's user.
 
     The name of an account needs its password. Raises ConfigurationError, SignInRefusedError.
     """
@@ -32,7 +32,7 @@ def acting_person(store: Store, operator: str, *, password_stdin: bool) -> Ident
 
 
 def typed_password(name: str, *, from_stdin: bool) -> str:
-    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError if none is given."""
+    """Return a password from the keyboard, or the next line of stdin. Raises ConfigurationError if none is given."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     try:

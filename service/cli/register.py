@@ -230,7 +230,7 @@ def _tell(result: PipelineResult, record: dict[str, Any], verdicts: Sequence[Gat
 def _file_detector(
     detector: DetectorName, boxes: Path | None, names: list[str], folder: Path | None, least: int
 ) -> tuple[DetectFile | None, Mapping[str, str]]:
-    """The detector for one file, None for the default, and the hashes of its weights, if it has any."""
+    """Return the detector for one file, None for the default, and the hashes of its weights, if it has any."""
     if boxes is not None and detector != "paper":
         raise typer.BadParameter("--boxes needs --detector paper")
     if detector == "paper":
@@ -264,7 +264,7 @@ def _spheres(
     control: str,
     seeds: str | None,
 ) -> tuple[Array, Array, float]:
-    """Centres of registration (M, 3) and control spheres (C, 3), and their radius, in metres."""
+    """Return centres of registration (M, 3) and control spheres (C, 3), and their radius, in metres."""
     if (mesh is None) == (spheres is None):
         raise typer.BadParameter("give either --mesh or --spheres")
     if spheres is not None:

@@ -68,7 +68,7 @@ def about_run(
 
 
 def gates_in_words(summary: RunSummary) -> dict[str, tuple[str, ...]]:
-    """Each judged step's gates in words, with their verdicts."""
+    """Return each judged step's gates in words, with their verdicts."""
     steps = {step.id: summary.state.steps[step.id] for step in summary.protocol.steps}
     return {
         name: tuple(
@@ -81,7 +81,7 @@ def gates_in_words(summary: RunSummary) -> dict[str, tuple[str, ...]]:
 
 
 def origin_sentence(summary: RunSummary, *, personal: bool = True) -> str:
-    """How the photographs came into the run."""
+    """Return how the photographs came into the run."""
     if summary.root.origin != "imported":
         return "The photographs were captured in this run"
     by = summary.root.operator if personal else _UNNAMED
@@ -89,7 +89,7 @@ def origin_sentence(summary: RunSummary, *, personal: bool = True) -> str:
 
 
 def _fusion(summary: RunSummary, *, personal: bool) -> tuple[tuple[str, str], ...]:
-    """How CT and scan agree, and what of the mesh comes from where."""
+    """Return how CT and scan agree, and what of the mesh comes from where."""
     fusion = recorded_fusion(summary)
     if fusion is None:
         return ()
@@ -122,7 +122,7 @@ def _fusion(summary: RunSummary, *, personal: bool) -> tuple[tuple[str, str], ..
 
 
 def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:
-    """Every device as it first identified itself in the run."""
+    """Return every device as it first identified itself in the run."""
     known = bodies(summary.events)
     found: dict[str, UsedDevice] = {}
     for event in summary.events:
@@ -135,7 +135,7 @@ def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:
 
 
 def _settings(summary: RunSummary) -> tuple[tuple[str, str], ...]:
-    """Camera settings of the protocol, the lens as the photographs state it, and the spheres."""
+    """Return the camera settings of the protocol, the lens as the photographs state it, and the spheres."""
     camera, spheres = summary.protocol.camera, summary.protocol.spheres
     optics = [recorded_optics(view.camera) for view in summary.captures()]
     lenses = dict.fromkeys(one.lens for one in optics if one.lens)

@@ -178,5 +178,5 @@ def _list(items: Sequence[str], none: str) -> list[str]:
 
 
 def _paragraphs(docstring: str) -> str:
-    """The docstring without its section of errors."""
+    """Return the docstring without its section of errors."""
     return inspect.cleandoc(docstring).split("\nRaises:")[0].strip()

@@ -29,12 +29,12 @@ _FORMATS = {
 
 
 def media_type(path: str) -> str:
-    """The media type of a file, by the end of its name."""
+    """Return the media type of a file, by the end of its name."""
     return _FORMATS.get(path.rpartition(".")[2], "application/octet-stream")
 
 
 def descriptor() -> Entity:
-    """The entity of the metadata file itself."""
+    """Return the entity of the metadata file itself."""
     return {
         "@id": METADATA,
         "@type": "CreativeWork",
@@ -44,7 +44,7 @@ def descriptor() -> Entity:
 
 
 def file_entity(path: str, sha256: str, size_bytes: int, description: str = "") -> Entity:
-    """A file of the crate."""
+    """Return a file of the crate."""
     return {
         "@id": path,
         "@type": "File",
@@ -57,7 +57,7 @@ def file_entity(path: str, sha256: str, size_bytes: int, description: str = "") 
 
 
 def software(version: str) -> Entity:
-    """This program."""
+    """Return the entity of this program."""
     return {"@id": "#software", "@type": "SoftwareApplication", "name": "orthocapture", "softwareVersion": version}
 
 
@@ -68,7 +68,7 @@ def person(account: str, full_names: Mapping[str, str]) -> Entity:
 
 
 def device(name: str, model: str, firmware: str, serial: str) -> Entity:
-    """A device as it first answered."""
+    """Return a device as it first answered."""
     return {
         "@id": anchor("device", name),
         "@type": "IndividualProduct",
@@ -79,7 +79,7 @@ def device(name: str, model: str, firmware: str, serial: str) -> Entity:
 
 
 def anchor(kind: str, name: str) -> str:
-    """An identifier within the crate that is a valid URI reference."""
+    """Return an identifier within the crate that is a valid URI reference."""
     return f"#{kind}-" + "".join(c if c.isascii() and c.isalnum() else f"_{ord(c):x}_" for c in name)
 
 
@@ -152,7 +152,7 @@ def _root(dataset: DataSet, words: str) -> Entity:
 
 
 def _run(about: About, devices: Sequence[Entity]) -> Entity:
-    """The run that made the data set, and the head of its chain of evidence."""
+    """Return the run that made the data set, and the head of its chain of evidence."""
     return {
         "@id": "#run",
         "@type": "CreateAction",
@@ -173,7 +173,7 @@ def _licence(about: About) -> Entity:
 
 
 def _parties(kind: str, found: Sequence[Party]) -> list[Entity]:
-    """People by their ORCID and bodies by their ROR, where they have one."""
+    """Return people by their ORCID and bodies by their ROR, where they have one."""
     return [
         {"@id": one.address or anchor(kind, one.name), "@type": one.kind, "name": one.name, **_names(one)}
         for one in found

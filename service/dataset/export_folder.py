@@ -71,7 +71,7 @@ class Part(NamedTuple):
 
 
 def json_bytes(document: object) -> bytes:
-    """A document as the UTF-8 text of a JSON file."""
+    """Return a document as the UTF-8 text of a JSON file."""
     return (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode()
 
 
@@ -130,7 +130,7 @@ class ExportFolder:
             self.parts.setdefault(part.role, {})[part.view] = name
 
     def listed(self) -> list[ListedFile]:
-        """The files that were written up to now, in order of their names; each is hashed once."""
+        """Return the files that were written up to now, in order of their names; each is hashed once."""
         found: list[ListedFile] = []
         for name, known in sorted(self._written.items()):
             path = self._root / name
@@ -173,7 +173,7 @@ class _Listed(ExportFolder):
 
 
 def count_files(write: Callable[[ExportFolder], object]) -> int:
-    """The number of files that a writer makes; none is made."""
+    """Return the number of files that a writer makes; none is made."""
     listed = _Listed(Path())
     write(listed)
     return listed.count
@@ -262,7 +262,7 @@ def discard(target: Path) -> None:
 
 
 def _beside(target: Path) -> tuple[Path, Path]:
-    """The unfinished folder, and the file that says what is being written and locks it."""
+    """Return the unfinished folder, and the file that says what is being written and locks it."""
     return target.with_name(f".{target.name}{_PART}"), target.with_name(f".{target.name}{_ABOUT}")
 
 

@@ -51,7 +51,7 @@ class StoredPixels:
         self._folder, self._mark = folder, mark
 
     def picture(self, view: PosedView) -> bytes:
-        """The pixels as PNG: the camera's own file is not in the folder."""
+        """Return the pixels as PNG: the camera's own file is not in the folder."""
         return png(self.colours(view), self._mark)
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
@@ -83,7 +83,7 @@ class StoredPixels:
 
 
 def scaled_data_set(dataset: DataSet, width: int) -> DataSet:
-    """The data set with pictures, depth and masks reduced to this width in pixels.
+    """Return the data set with pictures, depth and masks reduced to this width in pixels.
 
     Raises:
         DataError: a view is narrower.
@@ -127,7 +127,7 @@ class _Scaled:
         return self._nearest(self._whole.pixels.markers(self._views[view.name]), view).astype(np.bool_)
 
     def _nearest(self, pixels: NDArray[Any], view: PosedView) -> NDArray[Any]:
-        """The values (H, W, …) at the centres of the larger pixels."""
+        """Return the values (H, W, …) at the centres of the larger pixels."""
         rows, columns = (
             ((np.arange(small) + 0.5) * (large / small)).astype(np.int64)
             for small, large in zip((view.camera.height, view.camera.width), pixels.shape[:2], strict=True)

@@ -38,7 +38,7 @@ class Exporter:
 
 
 def exporters() -> dict[str, Exporter]:
-    """Every format by its name.
+    """Return every format by its name.
 
     Raises:
         ConfigurationError: two have the same name, or an entry point names something else.
@@ -47,7 +47,7 @@ def exporters() -> dict[str, Exporter]:
 
 
 def exporter(name: str) -> Exporter:
-    """The format of this name.
+    """Return the format of this name.
 
     Raises:
         ConfigurationError: there is none.

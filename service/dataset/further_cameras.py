@@ -65,7 +65,7 @@ class KnownFurtherCamera:
 
 
 def pose_sigmas(located: Answer) -> tuple[float, float]:
-    """Standard deviations of a located camera's position (m) and rotation (rad): roots of the traces."""
+    """Return the standard deviations of a located camera's position (m) and rotation (rad): roots of the traces."""
     variances = np.diag(np.array(located.covariance))
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
 
@@ -81,7 +81,7 @@ def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | No
 def further_poses(
     protocol: Protocol, state: RunState, views: Iterable[RecordedView], T_scan_first: Mapping[str, Matrix]
 ) -> dict[str, dict[str, Transform]]:
-    """T_scan_camera of every further camera by its name: by viewpoint if it is rigid, once if it is fixed."""
+    """Return T_scan_camera of every further camera by its name: by viewpoint if it is rigid, once if it is fixed."""
     found: dict[str, dict[str, Transform]] = {}
     for camera in known_further_cameras(protocol, state, views):
         for viewpoint in camera.images:
@@ -95,7 +95,7 @@ def further_poses(
 def known_further_cameras(
     protocol: Protocol, state: RunState, views: Iterable[RecordedView]
 ) -> tuple[KnownFurtherCamera, ...]:
-    """The further cameras that exposed at these valid views, in the order of the rig file."""
+    """Return the further cameras that exposed at these valid views, in the order of the rig file."""
     captures = [view for view in views if isinstance(view, ViewpointCaptured)]
     located = further_cameras(protocol, state)
     exposures: dict[str, list[tuple[str, FurtherExposure]]] = {}

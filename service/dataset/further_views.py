@@ -73,7 +73,7 @@ class FurtherViews:
         }
 
     def with_them(self, first: Splits) -> Splits:
-        """The splits with the images of the further cameras.
+        """Return the splits with the images of the further cameras.
 
         An image of a rigid camera is where its viewpoint is. Those of a fixed one all show the same, so they are all
         for training. None is among the sparse views.
@@ -88,7 +88,7 @@ class FurtherViews:
         )
 
     def joint(self, first: Array, viewpoints: Sequence[str]) -> Array:
-        """The joint covariance (6 V, 6 V) of the errors of all poses, in order of the views' names.
+        """Return the joint covariance (6 V, 6 V) of the errors of all poses, in order of the views' names.
 
         Args:
             first: (6 N, 6 N) of the first camera's poses.
@@ -115,7 +115,7 @@ class FurtherViews:
 
 
 def further_views(summary: RunSummary, T_scan_first: Mapping[str, Transform]) -> FurtherViews:
-    """The images of the further cameras at the registered viewpoints of the data set.
+    """Return the images of the further cameras at the registered viewpoints of the data set.
 
     Args:
         summary: the run.

@@ -67,7 +67,7 @@ class Photographs:
         self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
 
     def picture(self, view: PosedView) -> bytes:
-        """The file as the camera wrote it, except what was to be removed or marked."""
+        """Return the file as the camera wrote it, except what was to be removed or marked."""
         try:
             data = self._files[view.name].read_bytes()
         except OSError as error:
@@ -190,7 +190,7 @@ def cropped_data_set(
     most: int = 1,
     personal: bool = True,
 ) -> DataSet:
-    """Marker-free crops, named `VIEW_crop0`, `VIEW_crop1`, …, with the splits of their views.
+    """Return marker-free crops, named `VIEW_crop0`, `VIEW_crop1`, …, with the splits of their views.
 
     Args:
         dataset: whole images, distorted or not.

@@ -68,7 +68,7 @@ def posts_of(summary: RunSummary, spheres: Sequence[WorldSphere], views: Sequenc
 
 
 def _down_to(ground: _Ground, scan: Mesh, spheres: Sequence[WorldSphere]) -> tuple[Cylinder, ...]:
-    """A post below each sphere, down to the ground and at least to the lowest point of the scan."""
+    """Return a post below each sphere, down to the ground and at least to the lowest point of the scan."""
     lowest = min(ground.height_m, float((scan.vertices_m @ ground.up).min()))
     return tuple(
         post
@@ -83,7 +83,7 @@ def _down_to(ground: _Ground, scan: Mesh, spheres: Sequence[WorldSphere]) -> tup
 
 
 def _table(summary: RunSummary) -> _Ground | None:
-    """The table at a station, from the rig file and a registration of an arm's poses; None without either."""
+    """Return the table at a station, from the rig file and a registration of an arm's poses; None without either."""
     registrations = summary.registrations()
     registered = next((registrations[name] for name in reversed(ARM) if name in registrations), None)
     rig = None if registered is None else _rig(summary)
@@ -99,7 +99,7 @@ def _table(summary: RunSummary) -> _Ground | None:
 
 
 def _rig(summary: RunSummary) -> RigSection | None:
-    """The rig of a run; None if it was imported, or if an earlier version wrote what this one cannot read."""
+    """Return the rig of a run; None if it was imported, or if an earlier version wrote what this one cannot read."""
     if summary.root.origin == "imported":
         return None
     recorded = summary.root.rig

@@ -68,7 +68,7 @@ def make_preview(summary: RunSummary, folder: Path, progress: Progress) -> Previ
 
 
 def _begun(dataset: DataSet, crop: tuple[int, int]) -> Preview:
-    """All views, with the names of the files that they will have."""
+    """Return all views, with the names of the files that they will have."""
     named = dataset.splits.named()
     views = tuple(
         ViewPreview(
@@ -113,7 +113,7 @@ class SmallDepth:
 
 
 def crop_size(dataset: DataSet, wanted: Callable[[PosedView], Mask]) -> tuple[int, int]:
-    """Full HD where that is within the photograph, else a half, a third or a quarter of its sides.
+    """Return the full HD where that is within the photograph, else a half, a third or a quarter of its sides.
 
     The largest that is free of markers in one of three views; the smallest if none is.
 
@@ -159,7 +159,7 @@ def small_pictures(
 
 
 def small_camera(camera: CameraModel) -> CameraModel:
-    """The camera of the small picture."""
+    """Return the camera of the small picture."""
     if camera.width <= IMAGE_PX:
         return camera
     return camera.scaled(IMAGE_PX, max(1, round(camera.height * IMAGE_PX / camera.width)))

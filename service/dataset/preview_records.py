@@ -163,7 +163,7 @@ def write_preview(folder: Path, preview: Preview) -> None:
 
 
 def read_preview(folder: Path) -> Preview | None:
-    """The list; None if there is none that can be read."""
+    """Return the list; None if there is none that can be read."""
     try:
         return _PREVIEW.validate_json((folder / LIST).read_bytes())
     except (OSError, ValidationError):

@@ -48,7 +48,7 @@ class VertexFigures:
 
 
 def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_high_mm: float) -> GroundTruthPreview:
-    """The figures of a fusion as it was recorded, with the names of the files of its two coloured meshes."""
+    """Return the figures of a fusion as it was recorded, with the names of the files of its two coloured meshes."""
     measures = fusion.measures
     return GroundTruthPreview(
         step=fusion.step,
@@ -134,7 +134,7 @@ def fused_mesh(folder: Path, summary: RunSummary, fusion: RecordedFusion, mesh: 
 
 
 def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | None) -> DistancePreview:
-    """How far CT and scan are from each other, and the scan coloured by it.
+    """Return how far CT and scan are from each other, and the scan coloured by it.
 
     The figures and the picture are those that the fusion recorded. Without a fusion, CT and scan are brought together
     by their spheres and compared here, for the screen alone.
@@ -177,7 +177,7 @@ def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | 
 
 
 def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> DistancePreview:
-    """CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
+    """Return CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
     found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
     if found is None:
         raise DataError("the run has no CT", where=summary.run_id)
@@ -223,7 +223,7 @@ def _put_picture(folder: Path, picture: NDArray[np.uint8]) -> str:
 
 
 def _scene(summary: RunSummary, mesh: SimplifiedMesh, colours: MeshColours, poses: dict[str, Transform]) -> Scene:
-    """The coloured mesh with its spheres, and cameras if there are poses."""
+    """Return the coloured mesh with its spheres, and cameras if there are poses."""
     centres = summary.scan_spheres_m()
     spheres = [SceneSphere(str(k), "registration", centre) for k, centre in enumerate(centres)]
     shown = SceneMesh(mesh.points_m, mesh.triangles, colours=colours)

@@ -155,7 +155,7 @@ class About:
 
 
 def _party(text: str, otherwise: Literal["Person", "Organization", ""] = "") -> Party:
-    """A stated person or body; one that an older record has in a wrong form is named as it stands there."""
+    """Return a stated person or body; one that an older record has in a wrong form is named as it stands there."""
     try:
         return party(text, otherwise=otherwise)
     except DataError:
@@ -222,7 +222,7 @@ class Pixels(Interface):
     """The pixel data of a view; read or computed at each call, at the size of `view.camera`."""
 
     def picture(self, view: PosedView) -> bytes:
-        """The JPEG or PNG file. Raises DataError if it cannot be read."""
+        """Return the JPEG or PNG file. Raises DataError if it cannot be read."""
         ...
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
@@ -281,14 +281,14 @@ class DataSet:
         return SIMULATED if self.simulated else ""
 
     def errors_of(self, views: Sequence[int]) -> Array | None:
-        """(6 N, 6 N) `pose_errors` of the views with these numbers, which may repeat."""
+        """Return (6 N, 6 N) `pose_errors` of the views with these numbers, which may repeat."""
         if self.pose_errors is None:
             return None
         rows = (6 * np.array(views, dtype=np.int64)[:, None] + np.arange(6)).ravel()
         return self.pose_errors[np.ix_(rows, rows)]
 
     def keeping(self, names: tuple[str, ...]) -> DataSet:
-        """This data set with only these views, also in its splits."""
+        """Return this data set with only these views, also in its splits."""
         chosen = set(names)
         cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
         kept = [k for k, view in enumerate(self.views) if view.name in chosen]
@@ -307,7 +307,7 @@ class DataSet:
 
 
 def only_camera(dataset: DataSet, of: str) -> CameraModel:
-    """The camera of all views, for a format that has one.
+    """Return the camera of all views, for a format that has one.
 
     Raises:
         DataError: there is no view, or the views have several cameras.

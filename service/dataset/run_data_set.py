@@ -108,7 +108,7 @@ def specimen_pixels(summary: RunSummary, view: PosedView) -> np.ndarray[tuple[in
 
 
 def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple[Path, str]]]:
-    """The run's own registration with its name, and its images.
+    """Return the run's own registration with its name, and its images.
 
     Raises:
         DataError: there is none, no scan, or no image.
@@ -128,7 +128,7 @@ def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple
 def _pixels(
     summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[PosedView], mesh: Mesh, *, personal: bool
 ) -> tuple[Photographs, str]:
-    """Photographs, depth and masks of the views, and what the masks hold, in words."""
+    """Return photographs, depth and masks of the views, and what the masks hold, in words."""
     standing, others = _spheres(summary)
     posts = posts_of(summary, standing, views)
     pixels = Photographs(
@@ -143,7 +143,7 @@ def _pixels(
 
 
 def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
-    """File and hash of each registered image, by viewpoint."""
+    """Return the file and hash of each registered image, by viewpoint."""
     found: dict[str, tuple[Path, str]] = {}
     for capture in summary.captures():
         photograph = capture.artefacts[0]
@@ -159,7 +159,7 @@ def _further_view(one: FurtherView, covariance: Array) -> PosedView:
 
 
 def _in_order(views: Sequence[PosedView]) -> tuple[PosedView, ...]:
-    """The views in order of their names. Raises DataError if two have the same name."""
+    """Return the views in order of their names. Raises DataError if two have the same name."""
     ordered = tuple(sorted(views, key=lambda view: view.name))
     for one, other in pairwise(ordered):
         if one.name == other.name:
@@ -180,7 +180,7 @@ def _view(name: str, path: Path, registered: Registration, covariance: Array, ta
 
 
 def _spheres(summary: RunSummary) -> tuple[tuple[WorldSphere, ...], tuple[WorldSphere, ...]]:
-    """The registration spheres, and the others that an image may show."""
+    """Return the registration spheres, and the others that an image may show."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
     standing, others = (
         tuple(WorldSphere(np.array(centre), radius_m) for centre in centres)
@@ -190,7 +190,7 @@ def _spheres(summary: RunSummary) -> tuple[tuple[WorldSphere, ...], tuple[WorldS
 
 
 def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
-    """Centres of the control spheres, which the images show and the scan does not."""
+    """Return centres of the control spheres, which the images show and the scan does not."""
     before = control_scan(summary.protocol)
     if not before or not summary.state.steps[before].result:
         return ()
@@ -218,7 +218,7 @@ _REFERRING = (".obj", ".mtl", ".ply")
 
 
 def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
-    """The original files of the registered scan, under the names by which they refer to each other.
+    """Return the original files of the registered scan, under the names by which they refer to each other.
 
     Recorded files have lost their folders and may differ in case; a mesh finds its materials, and these find their
     textures, only under the names that are written in them.

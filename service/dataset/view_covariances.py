@@ -44,7 +44,7 @@ def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequen
 
 
 def stated_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:
-    """(6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, with that of the registration.
+    """Return (6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, with that of the registration.
 
     Stated for poses of an arm and of the spheres. None for other poses, and in runs of earlier versions.
 
@@ -59,7 +59,7 @@ def stated_pose_errors(summary: RunSummary, registered: Registration, names: Seq
 
 
 def _joint(summary: RunSummary, sha256: str, array: str, names: Sequence[str]) -> Array:
-    """(6 N, 6 N) of these viewpoints, from a file that has their names beside the array."""
+    """Return (6 N, 6 N) of these viewpoints, from a file that has their names beside the array."""
     with np.load(io.BytesIO(summary.store.artefact_path(sha256).read_bytes()), allow_pickle=False) as archive:
         order: list[str] = json.loads(str(archive["names"]))
         rows = (6 * np.array([order.index(name) for name in names])[:, None] + np.arange(6)).ravel()
@@ -67,14 +67,14 @@ def _joint(summary: RunSummary, sha256: str, array: str, names: Sequence[str]) -
 
 
 def _tracks(summary: RunSummary, registered: Registration) -> str | None:
-    """The file with the tracks from which the poses of a registration were adjusted."""
+    """Return the file with the tracks from which the poses of a registration were adjusted."""
     made = _job(summary, registered)
     tracks = None if made is None else made.arguments.get("tracks")
     return tracks if isinstance(tracks, str) else None
 
 
 def _job(summary: RunSummary, registered: Registration) -> JobState | None:
-    """The job that computed a registration."""
+    """Return the job that computed a registration."""
     finished = (job for job in jobs_of(summary.state).values() if job.status == "finished")
     made = (job for job in finished if job.kind == register.KIND.name)
     return next((job for job in made if register.KIND.read_answer(job.result) == registered), None)
@@ -153,7 +153,7 @@ def view_covariances(
 
 
 def _blocks(joint: Array) -> list[Array]:
-    """(6, 6) of each pose from the joint covariance (6 N, 6 N)."""
+    """Return (6, 6) of each pose from the joint covariance (6 N, 6 N)."""
     return [joint[k : k + 6, k : k + 6] for k in range(0, len(joint), 6)]
 
 
@@ -164,7 +164,7 @@ def _of_arm(registered: Registration) -> str:
 
 
 def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: Transform) -> Array:
-    """(6, 6) covariance of T_scan_camera that the covariance (6 or 7, …) of T_world_scan causes.
+    """Return (6, 6) covariance of T_scan_camera that the covariance (6 or 7, …) of T_world_scan causes.
 
     T_scan_camera = T_world_scan^-1 T_world_camera with the camera held: with R of T_world_scan and the vector a from
     its origin to the camera, in the world's axes, d_scan = R^T (a x w - d) and w_scan = -R^T w.

@@ -255,5 +255,5 @@ def at(**names: str) -> None:
 
 
 def where_now() -> Mapping[str, str]:
-    """The names that are set now."""
+    """Return the names that are set now."""
     return _now

@@ -44,7 +44,7 @@ class EscapingFormatter(logging.Formatter):
     """Lines in which nothing is left that a terminal would obey: messages may quote a device or a file."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One record as lines."""
+        """Return one record as lines."""
         return shown_continued(super().format(record))
 
 

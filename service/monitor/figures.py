@@ -185,7 +185,7 @@ def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
 
 
 def _database_bytes(path: Path) -> int:
-    """Size including the write-ahead log."""
+    """Return the size including the write-ahead log."""
     parts = (path, path.with_name(path.name + "-wal"))
     return sum(part.stat().st_size for part in parts if part.exists())
 

@@ -23,7 +23,7 @@ _NOT_SET_S = 16.0  # the kernel's value for an unknown error
 
 
 def host_clock() -> HostClock:
-    """The clock's state now; unknown values are None. Never raises."""
+    """Return the clock's state now; unknown values are None. Never raises."""
     return _of_chrony() or _of_kernel()
 
 

@@ -286,7 +286,7 @@ class Reporter:
             self._frame()
 
     def _snapshot(self, moment: _Moment, words: str, devices: OpenDevices) -> Snapshot:
-        """The state now, with readings of the devices that are due."""
+        """Return the state now, with readings of the devices that are due."""
         robot = read_robot(devices)
         # What a device told that is not connected any more is not the present state of anything.
         self._light = self._light if devices.lightboxes else LightReading()
@@ -337,7 +337,7 @@ class Reporter:
             self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
 
     def _starved_s(self) -> float:
-        """How long the main loop has waited for a processor since it last reported."""
+        """Return how long the main loop has waited for a processor since it last reported."""
         thread, waited_before_s = self._attends
         return waited_s(thread) - waited_before_s if thread else 0.0
 
@@ -349,7 +349,7 @@ class Reporter:
         self._watched = (asked_s, watch_robot(self.devices(), self.clock.monotonic_s()))
 
     def _elsewhere(self) -> str:
-        """The run's state in a few words, for alerts."""
+        """Return the run's state in a few words, for alerts."""
         newest = self._newest
         if newest.robot in STOPS:
             return f"the robot reports: {newest.robot.replace('_', ' ')}"

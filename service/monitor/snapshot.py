@@ -74,7 +74,7 @@ class Snapshot(Record):
     pedal_armed: bool = False  # pressed once; a second press lets the robot move
 
     def age_s(self, now_utc_s: float) -> float:
-        """Seconds since it was written, by now."""
+        """Return seconds since it was written, by now."""
         return now_utc_s - self.at_utc_s
 
     def shown(self) -> tuple[object, ...]:
@@ -106,7 +106,7 @@ class Snapshot(Record):
         return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
 
     def unattended_s(self, now_utc_s: float) -> float:
-        """Seconds since the main loop's last report, by now; infinity if the clock was set back since."""
+        """Return seconds since the main loop's last report, by now; infinity if the clock was set back since."""
         return age_s(self.at_utc_s, now_utc_s, if_set_back_s=math.inf) + self.quiet_s
 
     @property
@@ -130,7 +130,7 @@ def _path(data: Path, run_id: str, suffix: str) -> Path:
 
 
 def log_path(data: Path, run_id: str) -> Path:
-    """Path of the file that takes the output of a run's runner."""
+    """Return the path of the file that takes the output of a run's runner."""
     return _path(data, run_id, "log")
 
 
@@ -140,7 +140,7 @@ def write_snapshot(data: Path, run_id: str, snapshot: Snapshot) -> None:
 
 
 def read_snapshot(data: Path, run_id: str, now_utc_s: float) -> Snapshot:
-    """The latest snapshot; an unknown one if there is none, or if its runner has by now fallen silent."""
+    """Return the latest snapshot; an unknown one if there is none, or if its runner has by now fallen silent."""
     try:
         snapshot = Snapshot.model_validate_json(_path(data, run_id, "json").read_bytes())
     except (OSError, ValidationError):
@@ -237,7 +237,7 @@ class SignOfLife:
 
 
 def living_workers(data: Path, clock: Clock) -> list[WorkerSign]:
-    """The workers of a data folder that are alive, as far as is known; removes the files of dead ones."""
+    """Return the workers of a data folder that are alive, as far as is known; removes the files of dead ones."""
     now_utc_s = clock.utc_s()
     found: list[WorkerSign] = []
     for path in sorted(_folder(data).glob("*.json")):

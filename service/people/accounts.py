@@ -48,12 +48,12 @@ class Accounts:
         self._known = known
 
     def all(self) -> list[Account]:
-        """Every account, sorted by name."""
+        """Return every account, sorted by name."""
         with self._store.database.reading() as connection:
             return [to_account(row) for row in connection.execute(select(accounts).order_by(accounts.c.account))]
 
     def get(self, account: str) -> Account:
-        """The account of this name. Raises AccountError if there is none."""
+        """Return the account of this name. Raises AccountError if there is none."""
         with self._store.database.reading() as connection:
             return to_account(get_account(connection, account))
 
@@ -70,14 +70,14 @@ class Accounts:
     # --- one-time links ---
 
     def first_link(self) -> str | None:
-        """A new one-time token for making the first administrator, or None if there is one already."""
+        """Return a new one-time token for making the first administrator, or None if there is one already."""
         with self._store.database.writing() as connection:
             if self._administrators(connection):
                 return None
             return self._new_link(connection, "", FIRST_LINK_S, actor=SERVICE)
 
     def invitation(self, token: str) -> Invitation:
-        """The invitation of a link. Raises LinkError if the link is unknown, used or too old."""
+        """Return the invitation of a link. Raises LinkError if the link is unknown, used or too old."""
         with self._store.database.reading() as connection:
             return self._invitation(connection, token)
 

@@ -46,7 +46,7 @@ class ProtocolStanding:
 
 
 def approvals(store: Store, protocol: str, version: str) -> list[Approval]:
-    """All approvals for an id and version of a protocol, oldest first."""
+    """Return all approvals for an id and version of a protocol, oldest first."""
     found = (
         select(events)
         .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))
@@ -68,7 +68,7 @@ def _same(one: Approval, protocol: str, version: str) -> bool:
 
 
 def standing_of(store: Store, loaded: LoadedProtocol) -> ProtocolStanding:
-    """The standing of a protocol file on this site."""
+    """Return the standing of a protocol file on this site."""
     known = approvals(store, loaded.protocol.id, loaded.protocol.version)
     mine = [one for one in known if one.payload.sha256 == loaded.sha256]
     others = [one for one in known if one.payload.sha256 != loaded.sha256]
@@ -112,7 +112,7 @@ def approve(
 
 
 def difference(before: str, now: str) -> list[str]:
-    """The lines that differ, each with − or + and its line number, such as `− 41: min: 0.9`."""
+    """Return the lines that differ, each with − or + and its line number, such as `− 41: min: 0.9`."""
     out: list[str] = []
     old = new = 0
     for line in list(unified_diff(before.splitlines(), now.splitlines(), n=0, lineterm=""))[2:]:

@@ -36,7 +36,7 @@ def identity_for(
     known_by: KnownBy = "password",
     origin: SecretOrigin = TERMINAL,
 ) -> Identity | None:
-    """The person who acts, if the verb now needs a role; else None.
+    """Return the person who acts, if the verb now needs a role; else None.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.
@@ -47,7 +47,7 @@ def identity_for(
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
-    """The person who acts on the command line: by password where there are accounts, else by claim.
+    """Return the person who acts on the command line: by password where there are accounts, else by claim.
 
     Raises:
         NotAllowedError: there are accounts, and none has this name; or there are none, and this is no person's name.
@@ -111,7 +111,7 @@ def identify(
 
 
 def _claimed(typed: str) -> str:
-    """A name on a site without accounts. Raises NotAllowedError if it is no person's name."""
+    """Return a name on a site without accounts. Raises NotAllowedError if it is no person's name."""
     try:
         return person_name(typed)
     except ConfigurationError as error:

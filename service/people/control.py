@@ -194,7 +194,7 @@ class Control:
         )
 
     def _valid(self, connection: Connection, screen: str) -> Row[Any, Any, Any, Any] | None:
-        """The sign-in on a screen, unless it has ended."""
+        """Return the sign-in on a screen, unless it has ended."""
         row = connection.execute(
             select(sessions.c.account, sessions.c.locked, sessions.c.created_utc_s, accounts.c.full_name)
             .join(accounts, sessions.c.account == accounts.c.account)
@@ -243,7 +243,7 @@ class Control:
 
 
 def _full_name(connection: Connection, account: str) -> str:
-    """The name of the person with an account; "" for nobody."""
+    """Return the name of the person with an account; "" for nobody."""
     return connection.execute(select(accounts.c.full_name).where(accounts.c.account == account)).scalar() or ""
 
 

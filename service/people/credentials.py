@@ -31,7 +31,7 @@ class Passwords:
         self._hasher = hasher or PasswordHasher()
 
     def hash(self, secret: str) -> str:
-        """The hash to store, salt and parameters included."""
+        """Return the hash to store, salt and parameters included."""
         return self._hasher.hash(_same_form(secret))
 
     def matches(self, stored: str, secret: str) -> bool:
@@ -61,7 +61,10 @@ class ShortSecrets:
         self._pepper = pepper
 
     def hash(self, secret: str) -> str:
-        """The hash to store, with the name of the key to which it is bound. Raises StoreError without that key."""
+        """Return the hash to store, with the name of the key to which it is bound.
+
+        Raises StoreError without that key.
+        """
         return f"{self._bound()}{self._passwords.hash(self._pepper.bind(_same_form(secret)))}"
 
     def matches(self, stored: str, secret: str) -> bool:
@@ -107,7 +110,7 @@ def require_pin(pin: str) -> None:
 
 
 def plain_badge(typed: str) -> str:
-    """A badge's code in the form that is hashed. Raises AccountError if it cannot be a badge's."""
+    """Return a badge's code in the form that is hashed. Raises AccountError if it cannot be a badge's."""
     plain = typed.strip().upper()
     if not _BADGE.fullmatch(plain):
         raise AccountError(
@@ -119,12 +122,12 @@ def plain_badge(typed: str) -> str:
 
 
 def new_token() -> str:
-    """A token of 256 random bits for a cookie or a link."""
+    """Return a token of 256 random bits for a cookie or a link."""
     return secrets.token_urlsafe(32)
 
 
 def token_sha256(token: str) -> str:
-    """SHA-256 (hexadecimal) of a token, which is stored instead of it."""
+    """Return the SHA-256 (hexadecimal) of a token, which is stored instead of it."""
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -143,7 +146,7 @@ class Pepper:
         return hashlib.sha256(b"name of " + self._key).hexdigest()[:16]
 
     def bind(self, secret: str) -> str:
-        """The keyed hash (HMAC, RFC 2104) of a secret, hexadecimal."""
+        """Return the keyed hash (HMAC, RFC 2104) of a secret, hexadecimal."""
         return hmac.digest(self._key, secret.encode("utf-8", "surrogatepass"), "sha256").hex()
 
     @cached_property

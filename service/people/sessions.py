@@ -327,7 +327,7 @@ class People:
             )
 
     def screens(self, account: str) -> list[Screen]:
-        """The valid sign-ins of an account, newest first."""
+        """Return the valid sign-ins of an account, newest first."""
         with self._store.database.reading() as connection:
             rows = connection.execute(
                 select(sessions)

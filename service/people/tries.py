@@ -35,7 +35,7 @@ _AT_ONCE = 200  # rows
 
 
 def wait_after_s(failures: int) -> float:
-    """Seconds to wait after this many wrong passwords in a row."""
+    """Return seconds to wait after this many wrong passwords in a row."""
     over = failures - FREE_FAILURES
     return 0.0 if over < 0 else min(FIRST_WAIT_S * 2.0 ** min(over, 10), LONGEST_WAIT_S)
 
@@ -53,7 +53,7 @@ TERMINAL = SecretOrigin(address="terminal")
 
 
 def on_screen_of(person: Person) -> SecretOrigin:
-    """The screen on which a person is signed in."""
+    """Return the screen on which a person is signed in."""
     return SecretOrigin(screen=person.screen, by=person.account)
 
 
@@ -78,11 +78,11 @@ class KnownTries:
         return bool(origin.by) or origin == TERMINAL or (account, origin.address) in self._addresses
 
     def wait_s(self, account: str, origin: SecretOrigin) -> float:
-        """Seconds to wait before the next try; 0 for none."""
+        """Return seconds to wait before the next try; 0 for none."""
         return self._wait_s(_counted_at(account, origin))
 
     def longest_wait_s(self, account: str) -> float:
-        """The longest wait at any of the account's known origins."""
+        """Return the longest wait at any of the account's known origins."""
         return max((self._wait_s(counted) for counted in tuple(self._failed) if counted[0] == account), default=0.0)
 
     def failed(self, account: str, origin: SecretOrigin) -> None:
@@ -151,7 +151,7 @@ class KnownTries:
 
 
 def failed_tries(store: Store, window_s: float) -> list[tuple[str, float]]:
-    """(address, age in s) of every failed try at a sign-in within the last `window_s` seconds, oldest first.
+    """Return (address, age in s) of every failed try at a sign-in within the last `window_s` seconds, oldest first.
 
     A try that seems to be in the future, because the clock was set back, counts as made now. Since the first start of
     the service in the present boot, both clocks must say that a try is old. Raises IntegrityError.
@@ -175,7 +175,7 @@ def _recent(store: Store, window_s: float) -> Iterator[tuple[Row[Any], SignInRec
 
 
 def _first_start(store: Store) -> float:
-    """Number of the event of the service's first start in the present boot; infinity if there is none."""
+    """Return the number of the event of the service's first start in the present boot; infinity if there is none."""
     boot = store.clock.boot()
     if not boot:
         return inf

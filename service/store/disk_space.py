@@ -37,7 +37,7 @@ _WORTH_SAYING_BYTES = 1_000_000
 def forecast_of(
     store: Store, protocol: Protocol, state: RunState | None = None, *, simulated: bool = False
 ) -> Forecast:
-    """The forecast for a run in progress, or for one about to begin (`state` None). Raises StoreError."""
+    """Return the forecast for a run in progress, or for one about to begin (`state` None). Raises StoreError."""
     run_id = "" if state is None else state.run_id
     with store.database.reading() as connection:
         here = read_usage(connection, run_id) if run_id else Usage()
@@ -83,7 +83,7 @@ def _same_disk(one: Path, other: Path) -> bool:
 
 
 def read_usage(connection: Connection, run_id: str) -> Usage:
-    """Recorded sizes of a run's files so far."""
+    """Return recorded sizes of a run's files so far."""
     of_event = (event_index.c.run_id == artefacts.c.run_id) & (event_index.c.seq == artefacts.c.seq)
     found = (
         select(event_index.c.kind, func.sum(artefacts.c.size_bytes), func.count(artefacts.c.seq.distinct()))
@@ -100,7 +100,7 @@ def read_usage(connection: Connection, run_id: str) -> Usage:
 
 
 def _before(connection: Connection, run_id: str, protocol_id: str, *, simulated: bool) -> Usage | None:
-    """Usage of the newest other run of the protocol with photographs; None if there is none."""
+    """Return the usage of the newest other run of the protocol with photographs; None if there is none."""
     rows = connection.execute(
         text(
             "SELECT r.run_id FROM runs AS r JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 "
@@ -155,7 +155,7 @@ class Leftover:
 
 
 def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]:
-    """Every leftover, sorted by path; nothing is changed.
+    """Return every leftover, sorted by path; nothing is changed.
 
     Other foreign files, neither named by their hash nor an interrupted write, are faults for `audit verify`.
 
@@ -282,7 +282,7 @@ def _oldest_writer(connection: Connection) -> tuple[float, str]:
 
 
 def _last_start_utc(connection: Connection, run_id: str) -> str:
-    """When a runner last began to work on the run, as it was recorded then; "" if none has."""
+    """Return when a runner last began to work on the run, as it was recorded then; "" if none has."""
     started = (
         select(events.c.at_utc)
         .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))

@@ -64,7 +64,7 @@ def enqueue(
 
 
 def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Job | None:
-    """The job of a run with this key, or None."""
+    """Return the job of a run with this key, or None."""
     row = connection.execute(
         select(jobs).where(jobs.c.run_id == run_id, jobs.c.idempotency_key == storable(idempotency_key))
     ).one_or_none()
@@ -72,7 +72,7 @@ def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Jo
 
 
 def read_jobs(connection: Connection, run_id: str) -> list[Job]:
-    """All jobs of a run, oldest first."""
+    """Return all jobs of a run, oldest first."""
     return [
         to_job(row)
         for row in connection.execute(select(jobs).where(jobs.c.run_id == run_id).order_by(jobs.c.position))
@@ -80,7 +80,7 @@ def read_jobs(connection: Connection, run_id: str) -> list[Job]:
 
 
 def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> int:
-    """Number of jobs queued or being computed, of one run or of all, in one lane or in both."""
+    """Return the number of jobs queued or being computed, of one run or of all, in one lane or in both."""
     statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
     if run_id is not None:
         statement = statement.where(jobs.c.run_id == run_id)
@@ -104,7 +104,7 @@ class JobChoice:
     lane: Lane | None
 
     def condition(self) -> ColumnElement[bool]:
-        """The choice as a condition on the rows of `jobs`."""
+        """Return the choice as a condition on the rows of `jobs`."""
         return and_(
             _of_lane(self.lane),
             true() if self.kinds is None else jobs.c.kind.in_(tuple(self.kinds)),
@@ -248,7 +248,7 @@ def cancel(connection: Connection, clock: Clock, run_id: str, job_id: str, *, ac
 
 
 def held_row(connection: Connection, job: Job) -> Row[Any]:
-    """The row of a job whose lease is still `job.token`. Raises LeaseLostError."""
+    """Return the row of a job whose lease is still `job.token`. Raises LeaseLostError."""
     row = connection.execute(select(jobs).where(jobs.c.job_id == job.job_id)).one_or_none()
     if row is None or row.state != "running" or job.token is None or row.token != job.token:
         state = "gone" if row is None else f"{row.state}, worker {row.worker}"
@@ -307,7 +307,7 @@ def _end(connection: Connection, row: Row[Any], event: Event, *, state: str, err
 
 
 def to_job(row: Row[Any]) -> Job:
-    """A row of `jobs` as a Job."""
+    """Return a row of `jobs` as a Job."""
     return Job(
         job_id=row.job_id,
         run_id=row.run_id,

@@ -52,7 +52,7 @@ def begin_chain(
 
 
 def read_runs(connection: Connection) -> list[RunRow]:
-    """All runs, oldest first, without the site's chain."""
+    """Return all runs, oldest first, without the site's chain."""
     statement = (
         select(runs, heads.c.seq, heads.c.sha256)
         .outerjoin(heads, heads.c.run_id == runs.c.run_id)
@@ -91,7 +91,7 @@ def read_open_runs(connection: Connection) -> set[str]:
 
 
 def resolve_run(known: Sequence[RunRow], name: str) -> str:
-    """The run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+    """Return the run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
     if not known:
         raise UnknownRunError("there is no run in this data folder yet", remedy="Start one with `orthocapture run`")
     if name == "latest":
@@ -131,7 +131,7 @@ class ProcessIdentity:
 
     @classmethod
     def of_this_process(cls) -> ProcessIdentity:
-        """The identity of this process."""
+        """Return the identity of this process."""
         process = psutil.Process()
         return cls(socket.gethostname(), _boot(), process.pid, _started_s(process))
 
@@ -162,12 +162,12 @@ def _started_s(process: psutil.Process) -> float:
 
 
 def identity_of(row: Row[Any]) -> ProcessIdentity:
-    """The holder named in a row of `leases` or `jobs`."""
+    """Return the holder named in a row of `leases` or `jobs`."""
     return ProcessIdentity(row.host, row.boot, row.pid, row.process_started_s)
 
 
 def identity_values(identity: ProcessIdentity) -> dict[str, Any]:
-    """An identity as column values of `leases` or `jobs`."""
+    """Return an identity as column values of `leases` or `jobs`."""
     return {
         "host": identity.host,
         "boot": identity.boot,
@@ -228,7 +228,7 @@ def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
 
 
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
-    """Names, sorted, of the runs whose lease is held by a process that may still be alive."""
+    """Return names, sorted, of the runs whose lease is held by a process that may still be alive."""
     now_utc_s = clock.utc_s()
     rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
     return [row.run_id for row in rows if is_live(row, now_utc_s)]

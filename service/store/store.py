@@ -142,7 +142,7 @@ class Store:
         return self._clock
 
     def free_bytes(self) -> int:
-        """Free space in bytes on the disk of the data folder. Raises StoreError."""
+        """Return the free space in bytes on the disk of the data folder. Raises StoreError."""
         try:
             return shutil.disk_usage(self.database_path.parent).free
         except OSError as error:
@@ -188,7 +188,10 @@ class Store:
         )
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The read-only file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
+        """Return the read-only file of an artefact.
+
+        Raises IntegrityError if it is missing or, with `verify`, altered.
+        """
         return self._folder.verified_path(sha256) if verify else self._folder.path(sha256)
 
     # --- runs and events ---
@@ -227,17 +230,20 @@ class Store:
         return append(connection, self._clock, run_id, payloads, actor)
 
     def runs(self) -> list[RunRow]:
-        """All runs, oldest first."""
+        """Return all runs, oldest first."""
         with self._database.reading() as connection:
             return read_runs(connection)
 
     def open_runs(self) -> set[str]:
-        """Names of the runs that have not ended, from the index of events without reading them all."""
+        """Return names of the runs that have not ended, from the index of events without reading them all."""
         with self._database.reading() as connection:
             return read_open_runs(connection)
 
     def find_run(self, name: str) -> str:
-        """The run called `name`: a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+        """Return the run called `name`: a full name, an unambiguous beginning, or `latest`.
+
+        Raises UnknownRunError.
+        """
         return resolve_run(self.runs(), name)
 
     def record(
@@ -271,13 +277,16 @@ class Store:
         return events
 
     def events(self, run_id: str, after_seq: int = 0) -> list[Event]:
-        """A run's events after a sequence number, in order. The chain is not verified (verification.verify does)."""
+        """Return a run's events after a sequence number, in order.
+
+        The chain is not verified (verification.verify does).
+        """
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_events(connection, run_id, after_seq)
 
     def first_event(self, run_id: str) -> Event:
-        """A run's first event, without reading the others. Raises IntegrityError if it is missing."""
+        """Return a run's first event, without reading the others. Raises IntegrityError if it is missing."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             row = connection.execute(select(events).where(events.c.run_id == run_id, events.c.seq == 1)).one_or_none()
@@ -286,7 +295,7 @@ class Store:
         return to_event(row)
 
     def head(self, run_id: str) -> int:
-        """Sequence number of a run's last event. Raises UnknownRunError."""
+        """Return the sequence number of a run's last event. Raises UnknownRunError."""
         with self._database.reading() as connection:
             seq: int | None = connection.execute(_HEAD, {"run": run_id}).scalar()
         if seq is None:
@@ -294,7 +303,7 @@ class Store:
         return seq
 
     def artefacts(self, run_id: str) -> list[Artefact]:
-        """All recorded artefacts of a run, in the order of its events."""
+        """Return all recorded artefacts of a run, in the order of its events."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_artefacts(connection, run_id)
@@ -311,7 +320,7 @@ class Store:
             return read_checkpoints(connection, run_id)
 
     def timestamps(self, run_id: str) -> list[Timestamp]:
-        """The time stamps on a run's checkpoints, oldest first."""
+        """Return the time stamps on a run's checkpoints, oldest first."""
         with self._database.reading() as connection:
             return read_timestamps(connection, run_id)
 
@@ -327,7 +336,7 @@ class Store:
             return is_held(connection, self._clock, run_id)
 
     def driven_runs(self) -> list[str]:
-        """Names of all runs whose lease a living process holds."""
+        """Return names of all runs whose lease a living process holds."""
         with self._database.reading() as connection:
             return held_runs(connection, self._clock)
 
@@ -338,7 +347,7 @@ class Store:
     # --- jobs ---
 
     def jobs(self, run_id: str) -> list[Job]:
-        """All jobs of a run, oldest first."""
+        """Return all jobs of a run, oldest first."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return queue.read_jobs(connection, run_id)
@@ -349,7 +358,7 @@ class Store:
             return queue.started(connection, self.clock, run_id)
 
     def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
-        """Number of jobs of a run, or of all runs, that are queued or being computed.
+        """Return the number of jobs of a run, or of all runs, that are queued or being computed.
 
         `lane` counts only jobs that a person or a step waits for ("waited"), or only the others ("background").
         """

@@ -94,7 +94,7 @@ class Connections:
         return connection
 
     def find(self, peer: Peer) -> Connection | None:
-        """The connection that a request came by, while it lasts."""
+        """Return the connection that a request came by, while it lasts."""
         return self._open.get(peer)
 
     def leave(self, connection: Connection) -> None:
@@ -151,7 +151,7 @@ class Connections:
 
 
 def plain_address(text: str) -> str:
-    """An address in its usual form, so that one client has one name: ::ffff:10.0.0.7 is 10.0.0.7."""
+    """Return an address in its usual form, so that one client has one name: ::ffff:10.0.0.7 is 10.0.0.7."""
     try:
         address = ip_address(text)
     except ValueError:
@@ -182,7 +182,7 @@ class OpenStreams:
 
     @contextmanager
     def opened(self, screen: str) -> Generator[OpenStream]:
-        """A place among the streams of a sign-in, for as long as it lasts."""
+        """Yield a place among the streams of a sign-in, for as long as it lasts."""
         count = Counter(stream.screen for stream in self._open)
         if count[screen] >= self._per_screen:
             self._end_oldest(screen)
@@ -268,6 +268,6 @@ def _nothing() -> None:
 
 
 def affordable_connections(wanted: int) -> int:
-    """The wanted number of connections, at most half of the files that this process may open."""
+    """Return the wanted number of connections, at most half of the files that this process may open."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))

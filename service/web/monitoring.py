@@ -107,7 +107,7 @@ class DataFolderMetrics(Collector):
         return ()
 
     def collect(self) -> Iterable[Metric]:
-        """One scrape."""
+        """Yield one scrape."""
         health = self._health()
         parts = {
             "database": health.database,
@@ -290,7 +290,10 @@ def _driven(site: Site) -> list[str]:
 
 @router.get("/health", name="health")
 def health(site: CurrentSite) -> JSONResponse:
-    """Health of database, data folder, workers, runners and second place. Status 200 if all are well, else 503."""
+    """Show the health of database, data folder, workers, runners and second place.
+
+    Status 200 if all are well, else 503.
+    """
     found = read_health(site.store, site.data, _driven(site), site.second_place.away)
     parts = {
         "database": found.database,
@@ -305,6 +308,6 @@ def health(site: CurrentSite) -> JSONResponse:
 
 @router.get("/metrics", name="metrics", dependencies=[Depends(ReaderOrLocalRequest("read", while_locked=False))])
 def metrics(request: Request) -> Response:
-    """The figures for Prometheus."""
+    """Show the figures for Prometheus."""
     content = generate_latest(cast(CollectorRegistry, request.app.state.metrics))
     return Response(content, media_type=CONTENT_TYPE_LATEST)

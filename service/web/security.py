@@ -258,7 +258,7 @@ def clear_cookie(response: Response, site: Site) -> None:
 
 
 def token_of(request: Request, site: Site) -> str:
-    """The token that came with a request; "" for none."""
+    """Return the token that came with a request; "" for none."""
     return request.cookies.get(cookie_name(site), "")
 
 

@@ -119,7 +119,7 @@ class ForwardedClient:
 
 
 def _address(entry: str) -> str:
-    """The address of an entry, which may have a port; "" for anything else."""
+    """Return the address of an entry, which may have a port; "" for anything else."""
     if entry.startswith("["):
         entry = entry[1:].partition("]")[0]
     elif entry.count(":") == 1:
@@ -231,7 +231,10 @@ def sparing_log(clock: Clock) -> Generator[SparingHandler]:
 
 
 def known_proxies(addresses: Sequence[str]) -> frozenset[str]:
-    """The addresses of trusted proxies in their usual form. Raises ConfigurationError for what is not an address."""
+    """Return the addresses of trusted proxies in their usual form.
+
+    Raises ConfigurationError for what is not an address.
+    """
     for address in addresses:
         try:
             ip_address(address)
@@ -246,7 +249,7 @@ def known_proxies(addresses: Sequence[str]) -> frozenset[str]:
 
 @contextmanager
 def listening(host: str, port: int, limits: ConnectionLimits, proxies: frozenset[str]) -> Generator[Listener]:
-    """The socket, bound before anything is recorded: a second server on the port changes nothing."""
+    """Yield the socket, bound before anything is recorded: a second server on the port changes nothing."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with Listener(family, Connections(limits, without_limit=proxies)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -265,7 +268,7 @@ def listening(host: str, port: int, limits: ConnectionLimits, proxies: frozenset
 def server(
     app: FastAPI, listener: Listener, proxies: frozenset[str], tls: tuple[Path, Path] | None, log: SparingHandler
 ) -> Server:
-    """The server of an application on a socket."""
+    """Return the server of an application on a socket."""
     config = uvicorn.Config(
         Reception(ForwardedClient(app, proxies), listener.connections),
         loop="asyncio",  # its servers accept through the listener

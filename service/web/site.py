@@ -45,7 +45,7 @@ class Launcher:
         return self.store.driven(run_id)
 
     def driven_runs(self) -> list[str]:
-        """All runs of which `driven` is true, by name."""
+        """Return all runs of which `driven` is true, by name."""
         with self._lock:
             started = {run_id for run_id, child in self._children.items() if child.poll() is None}
         return sorted(started.union(self.store.driven_runs()))
@@ -94,7 +94,7 @@ class OpenedRuns:
     _lock: Lock = field(init=False, default_factory=Lock)  # of the two above; held for moments
 
     def now(self, run_id: str) -> RunRecord:
-        """A run's record as of now. Raises what `first_read` raises, and IntegrityError."""
+        """Return a run's record as of now. Raises what `first_read` raises, and IntegrityError."""
         with self._lock:
             run = self._runs.get(run_id)
             lock = self._locks.setdefault(run_id, Lock())
@@ -130,11 +130,14 @@ class Site:
         self.second_place = second_place(self.rig, self.store)
 
     def run(self, run_id: str) -> RunRecord:
-        """A run's record as of now. Raises UnknownRunError, IntegrityError."""
+        """Return a run's record as of now. Raises UnknownRunError, IntegrityError."""
         return self.runs.now(run_id)
 
     def step_times(self, run_id: str) -> EarlierTimes:
-        """How long the steps took in the runs before this one; read once. Raises UnknownRunError, StoreError."""
+        """Return how long the steps took in the runs before this one; read once.
+
+        Raises UnknownRunError, StoreError.
+        """
         if run_id not in self._step_times:
             from service.monitor.figures import read_step_times  # noqa: PLC0415 - of runs under way only
 
@@ -142,7 +145,7 @@ class Site:
         return self._step_times[run_id]
 
     def protocol_files(self) -> list[Path]:
-        """Protocols that can be started."""
+        """Return protocols that can be started."""
         return sorted(self.protocols.glob("*.yaml"))
 
     def _first_read(self, run_id: str) -> RunFollower:

@@ -73,7 +73,7 @@ class BundleZip:
 
 @contextmanager
 def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | None = None) -> Generator[BundleZip]:
-    """A zip file that gets its name only when it is complete and durable; otherwise nothing is left of it.
+    """Yield a zip file that gets its name only when it is complete and durable; otherwise nothing is left of it.
 
     Args:
         target: the file.
@@ -156,7 +156,7 @@ def readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -
 
 
 def _warnings(root: RunStarted, missing: Sequence[str]) -> str:
-    """Paragraphs on a simulated rig, imported images and missing results; each ends with an empty line."""
+    """Return paragraphs on a simulated rig, imported images and missing results; each ends with an empty line."""
     found: list[str] = []
     if root.simulated:
         found.append("SIMULATED: no real device took part in this run. It is not a record of a real acquisition.")

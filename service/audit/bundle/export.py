@@ -68,7 +68,7 @@ ReportMaker = Callable[[AuditReport, int], bytes]  # (result of the verification
 
 
 def marked_name(name: str, *, simulated: bool) -> str:
-    """The name of an exported file; for a simulated run it contains SIMULATED."""
+    """Return the name of an exported file; for a simulated run it contains SIMULATED."""
     if not simulated or MARK in name:
         return name
     stem, dot, suffix = name.rpartition(".")
@@ -203,7 +203,7 @@ def _add_manifest(bundle: BundleZip, store: Store, run: BundledRun, *, hashes_on
 
 
 def _zip_time(at_utc: str) -> ZipTime:
-    """The time of the last event, so that the same evidence gives the same bytes; zip has no odd seconds."""
+    """Return the time of the last event, so that the same evidence gives the same bytes; zip has no odd seconds."""
     year, month, day = (int(part) for part in at_utc[:10].split("-"))
     hour, minute, second = (int(part) for part in at_utc[11:19].split(":"))
     return max(year, 1980), month, day, hour, minute, second - second % 2

@@ -82,7 +82,7 @@ def keep_request(target: Path, request: ExportRequest) -> None:
 
 
 def kept_request(target: Path) -> ExportRequest:
-    """The request beside a folder.
+    """Return the request beside a folder.
 
     Raises:
         DataError: there is none that can be read.
@@ -108,7 +108,7 @@ def discard_unfinished(target: Path) -> None:
 
 
 def unfinished_exports(folder: Path, run_id: str) -> list[UnfinishedExport]:
-    """The unfinished exports of a run in a folder of exports, the newest first."""
+    """Return the unfinished exports of a run in a folder of exports, the newest first."""
     found: list[UnfinishedExport] = []
     for path in sorted(folder.glob(f".{run_id}*{_WANTED}"), reverse=True):
         target = folder / path.name.removeprefix(".").removesuffix(_WANTED)

@@ -24,7 +24,7 @@ class OpenedDevice:
 
 
 def opened_devices(rows: Iterable[EventRow]) -> list[OpenedDevice]:
-    """The devices of some device_opened events, read with their payloads."""
+    """Return the devices of some device_opened events, read with their payloads."""
     opened = ((row, row.record(DeviceOpened)) for row in rows)
     return [
         OpenedDevice(row, known.device, recorded_report(known.report)) for row, known in opened if known is not None
@@ -32,7 +32,7 @@ def opened_devices(rows: Iterable[EventRow]) -> list[OpenedDevice]:
 
 
 def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[OpenedDevice]) -> CameraBodies:
-    """Serial numbers of the cameras among the opened devices."""
+    """Return serial numbers of the cameras among the opened devices."""
     rows = connection.execute(
         text(
             "SELECT DISTINCT json_extract(e.payload, '$.camera.body_serial') AS body "
@@ -66,7 +66,7 @@ class ClockSeries:
 
 
 def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
-    """The robot controller's clock minus the host's monotonic one, as every capture recorded it.
+    """Return the robot controller's clock minus the host's monotonic one, as every capture recorded it.
 
     Each start of the runner has a series of its own: the host's monotonic clock starts again with every boot.
     """
@@ -113,7 +113,7 @@ class Session:
 
 
 def sessions(rows: Sequence[EventRow]) -> list[Session]:
-    """The starts of a runner, each compared with the one before."""
+    """Return the starts of a runner, each compared with the one before."""
     found: list[Session] = []
     before: dict[str, str] | None = None
     for row in rows:

@@ -53,7 +53,7 @@ class CorrectedValue:
 
 
 def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue]:
-    """All corrections of a run, in order."""
+    """Return all corrections of a run, in order."""
     rows = read_rows(
         connection, run_id, seqs_of_kind(connection, run_id, ["record_corrected"], limit=LISTED), whole=True
     )
@@ -83,12 +83,12 @@ def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue
 
 
 def value_text(value: Any) -> str:
-    """A value as text: strings unchanged, anything else as JSON."""
+    """Return a value as text: strings unchanged, anything else as JSON."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def value_at(payload: Mapping[str, Any], path: str) -> Any:
-    """The value at a path such as environment.light_lux or verdicts.0.value; None if there is none."""
+    """Return the value at a path such as environment.light_lux or verdicts.0.value; None if there is none."""
     value: Any = payload
     for part in path.split("."):
         if isinstance(value, Mapping) and part in value:
@@ -125,7 +125,7 @@ class ReplacedStep:
 
 
 def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[ReplacedStep]:
-    """The steps with a superseded or retried attempt, in the protocol's order."""
+    """Return the steps with a superseded or retried attempt, in the protocol's order."""
     rows = connection.execute(
         text(
             "SELECT e.seq, e.at_utc, i.step, json_extract(e.payload, '$.attempt') AS attempt, "
@@ -176,7 +176,7 @@ class ReplacedViewpoint:
 
 
 def replaced_viewpoints(digest: Digest) -> list[ReplacedViewpoint]:
-    """All retaken viewpoints, in order."""
+    """Return all retaken viewpoints, in order."""
     if digest.state is None:
         return []
     return [
@@ -195,7 +195,7 @@ def replaced_viewpoints(digest: Digest) -> list[ReplacedViewpoint]:
 
 
 def events_of(connection: Connection, run_id: str, *kinds: str, newest: bool = False) -> list[EventRow]:
-    """The events of some kinds with their payloads, LISTED of them at most."""
+    """Return the events of some kinds with their payloads, LISTED of them at most."""
     seqs = seqs_of_kind(connection, run_id, kinds, limit=LISTED, newest=newest)
     return read_rows(connection, run_id, seqs, whole=True)
 
@@ -240,7 +240,7 @@ def correct(store: Store, run_id: str, *, of_seq: int, field: str, new: str, rea
 
 
 def correctable(payload: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The fields that can be corrected, each with its value as text; a few hundred at most."""
+    """Return the fields that can be corrected, each with its value as text; a few hundred at most."""
     found: list[tuple[str, str]] = []
 
     def walk(value: Any, path: tuple[str, ...]) -> None:

@@ -45,7 +45,7 @@ NOTE_GROUPS = tuple(group for group in GROUPS if group not in DEVIATION_GROUPS) 
 
 
 def group_name(group: str, number: int) -> str:
-    """The name of a group for this number of findings."""
+    """Return the name of a group for this number of findings."""
     return _OF_ONE[group] if number == 1 else GROUPS[group][0]
 
 
@@ -115,7 +115,7 @@ def _of_gate(gate: FailedGate) -> Finding:
 
 
 def counts(digest: Digest) -> dict[str, int]:
-    """The number of findings in each group."""
+    """Return the number of findings in each group."""
     by_kind: dict[str, int] = {}
     for deviation in (*digest.deviations, *digest.automatic):
         by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
@@ -143,7 +143,7 @@ class RunFilter:
     q: str = ""
 
     def query(self) -> dict[str, str]:
-        """The filter as query parameters of a link."""
+        """Return the filter as query parameters of a link."""
         names = ("since", "until", "protocol", "person", "status", "simulated", "q")
         fields = {name: getattr(self, name) for name in names}
         fields |= {"deviations": "1" if self.deviations else "", "unverified": "1" if self.unverified else ""}
@@ -177,7 +177,7 @@ class ListedRun:
 
 
 def verified(verification: Verification | None, head_sha256: str) -> str:
-    """The state of a verification: "never", "faults", "outdated" (there are newer events) or "current"."""
+    """Return the state of a verification: "never", "faults", "outdated" (there are newer events) or "current"."""
     if verification is None:
         return "never"
     if not verification.ok:
@@ -209,12 +209,12 @@ def matches(run: ListedRun, wanted: RunFilter) -> bool:
 
 
 def known(value: Digest | PartialProgress) -> Digest | None:
-    """The digest, or None while it is being computed."""
+    """Return the digest, or None while it is being computed."""
     return None if isinstance(value, PartialProgress) else value
 
 
 def people_of(runs: Sequence[ListedRun]) -> list[str]:
-    """Everybody who took part in any of these runs."""
+    """Return everybody who took part in any of these runs."""
     return sorted(
         {name for run in runs for name in (run.basics.operator, *(run.digest.people if run.digest else ()))}
     )

@@ -31,7 +31,10 @@ class RecordedSignature:
 
 
 def signatures(connection: Connection, run_id: str, digest: Digest | None) -> list[RecordedSignature]:
-    """All signatures of a run in order, its release included. With `digest`, also whether each is still valid."""
+    """Return all signatures of a run in order, its release included.
+
+    With `digest`, also whether each is still valid.
+    """
     # The word index narrows the actions down before any payload is read.
     seqs = connection.execute(
         text(

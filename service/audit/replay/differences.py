@@ -209,7 +209,7 @@ def _scalar(a: float, b: float, path: str) -> Difference:
 
 
 def unit_of(path: str) -> tuple[str, float]:
-    """The unit to show and the factor to it, by the last name in a path that has one."""
+    """Return the unit to show and the factor to it, by the last name in a path that has one."""
     for name in reversed(re.split(r"[.\[\] ]+", path)):
         for ending in sorted(_UNITS, key=len, reverse=True):
             if name.endswith(ending):
@@ -232,7 +232,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _numbers(values: Sequence[Any]) -> Array | None:
-    """Nested lists of numbers as an array, or None."""
+    """Return nested lists of numbers as an array, or None."""
     if not _only_numbers(values):
         return None
     try:

@@ -51,7 +51,7 @@ class CopiedResults:
                 self._index(job, f"{path}/{index}", item)
 
     def as_references(self, arguments: Any) -> Any:
-        """The arguments with a reference in place of every copy."""
+        """Return the arguments with a reference in place of every copy."""
         if _is_telling(arguments):
             found = self._parts.get(_key(arguments))
             if found is not None:
@@ -115,7 +115,7 @@ class RecomputedJobs:
         self.pairs.append(_Pair(step, job, again))
 
     def arguments(self, job: JobState) -> Mapping[str, Any]:
-        """A job's arguments with the recomputed answers of earlier jobs."""
+        """Return a job's arguments with the recomputed answers of earlier jobs."""
         return self._with_new_hashes(resolve(self._copied.as_references(job.arguments), self._jobs))
 
     def _with_new_hashes(self, value: Any) -> Any:
@@ -139,7 +139,7 @@ class RecomputedJobs:
 
 
 def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
-    """The drift of every registration that was computed again."""
+    """Yield the drift of every registration that was computed again."""
     spheres = summary.scan_spheres_m()
     if not spheres:
         return
@@ -166,7 +166,7 @@ class ScratchStore:
         self._folder = folder
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """A recomputed file, or else the recorded one. Raises IntegrityError."""
+        """Return a recomputed file, or else the recorded one. Raises IntegrityError."""
         own = self._folder / sha256
         return own if own.is_file() else self._recorded.artefact_path(sha256, verify=verify)
 

@@ -36,7 +36,7 @@ from service.store.verification.verify import AuditReport
 
 
 def facts(run: RecordedRun) -> DescriptionList:
-    """Names and values for the first page."""
+    """Return names and values for the first page."""
     root, state, events = run.root, run.state, run.events
     shots = shots_by_step(run.protocol, state, failed_exposures(events))
     others = sorted(run.named(person) for person in state.people - {root.operator})
@@ -74,7 +74,7 @@ def facts(run: RecordedRun) -> DescriptionList:
 
 
 def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, TableCell | str]]:
-    """Specimen, site and purpose as entered, the rig, and the machine that drove the run."""
+    """Yield the specimen, site and purpose as entered, the rig, and the machine that drove the run."""
     entered = about_facts(run)
     names = {name for name, _ in entered}
     if "Specimen" not in names:
@@ -89,7 +89,7 @@ def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, TableCell | str]
 
 
 def _rig_name(run: RecordedRun) -> str:
-    """The name in the rig file; "" for imported photographs, or if the file is missing or altered."""
+    """Return the name in the rig file; "" for imported photographs, or if the file is missing or altered."""
     if run.root.origin == "imported":
         return ""
     try:
@@ -187,14 +187,14 @@ def _verification(audit: AuditReport) -> TableCell:
 
 
 def _origin(run: RecordedRun) -> TableCell | None:
-    """The statement on imported photographs; None if the run took its photographs itself."""
+    """Return the statement on imported photographs; None if the run took its photographs itself."""
     if run.root.origin != "imported":
         return None
     return TableCell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
 
 
 def _release(run: RecordedRun) -> TableCell | None:
-    """The statement on the release; None if the protocol does not ask for one."""
+    """Return the statement on the release; None if the protocol does not ask for one."""
     if run.protocol.release != "second_person":
         return None
     if run.state.released_by:

@@ -44,7 +44,7 @@ class RunSearch:
         return any((self.q.strip(), self.since, self.until, self.result))
 
     def query(self) -> dict[str, str]:
-        """The search as query parameters of a link."""
+        """Return the search as query parameters of a link."""
         fields = {"q": self.q, "since": self.since, "until": self.until, "result": self.result}
         return {name: value for name, value in fields.items() if value}
 
@@ -97,7 +97,7 @@ class FoundRun:
 
 
 def find_runs(store: Store, wanted: RunSearch) -> list[FoundRun]:
-    """The runs that match, newest first. If a first event cannot be read, its fields are empty."""
+    """Return the runs that match, newest first. If a first event cannot be read, its fields are empty."""
     with store.database.reading() as connection:
         every = _every(connection)
     terms = wanted.q.casefold().split()

@@ -99,7 +99,7 @@ _ESCAPED = re.compile(r'[\x00-\x1f"\\]')
 
 
 def canonical(value: Any) -> bytes:
-    """RFC 8785 canonical JSON. Raises ValueError for what has none."""
+    """Return RFC 8785 canonical JSON. Raises ValueError for what has none."""
     parts: list[str] = []
     _write(value, parts)
     return "".join(parts).encode("utf-8")  # a lone surrogate raises UnicodeEncodeError, which is a ValueError
@@ -138,7 +138,7 @@ def _string(text: str) -> str:
 
 
 def number(value: float) -> str:
-    """A double as ECMAScript writes it (Number::toString): the shortest digits that read back as the same."""
+    """Return a double as ECMAScript writes it (Number::toString): the shortest digits that read back as the same."""
     if not math.isfinite(value):
         raise ValueError(f"{value} has no JSON form")
     if value == 0:
@@ -172,7 +172,7 @@ def short_words(error: Exception) -> str:
 
 
 def parse(text: bytes) -> Any:
-    """JSON without duplicate names, NaN and infinity. Raises ValueError."""
+    """Return JSON without duplicate names, NaN and infinity. Raises ValueError."""
     try:
         found = json.loads(
             text.decode("utf-8"), object_pairs_hook=_pairs, parse_int=_integer, parse_constant=_constant
@@ -219,11 +219,11 @@ class Bundle:
     left_by_others: Sequence[str] = ()
 
     def open(self, name: str) -> IO[bytes]:
-        """A stream of one file."""
+        """Return a stream of one file."""
         raise NotImplementedError
 
     def read(self, name: str, limit: int) -> bytes:
-        """A small file as a whole. Raises ValueError when it is longer than it may be."""
+        """Return a small file as a whole. Raises ValueError when it is longer than it may be."""
         with self.open(name) as stream:
             content = stream.read(limit + 1)
         if len(content) > limit:
@@ -231,7 +231,7 @@ class Bundle:
         return content
 
     def lines(self, name: str) -> Iterator[bytes]:
-        """The lines of a file without their ends. Raises ValueError for one that is too long or not ended."""
+        """Yield the lines of a file without their ends. Raises ValueError for one that is too long or not ended."""
         with self.open(name) as stream:
             while line := stream.readline(LARGEST_LINE):
                 if not line.endswith(b"\n"):
@@ -337,7 +337,7 @@ class ZipLayout:
         return start, end, count
 
     def _directory_names(self, start: int, end: int) -> list[bytes]:
-        """The names in the directory, as bytes. Raises ValueError, struct.error."""
+        """Return the names in the directory, as bytes. Raises ValueError, struct.error."""
         names: list[bytes] = []
         while start < end:
             head = self._at(start, 46)
@@ -354,7 +354,7 @@ class ZipLayout:
         return names
 
     def _check_extra(self, extra: bytes) -> bytes:
-        """The sizes beyond 4 GB among the extra fields. Raises ValueError, struct.error."""
+        """Return the sizes beyond 4 GB among the extra fields. Raises ValueError, struct.error."""
         sizes = b""
         while extra:
             kind, size = struct.unpack("<2H", extra[:4])
@@ -366,7 +366,7 @@ class ZipLayout:
         return sizes
 
     def _entry_problems(self, infos: Sequence[zipfile.ZipInfo], names: Sequence[bytes], end: int) -> list[str]:
-        """Entries that do not follow each other, or whose own header differs from the directory."""
+        """Return entries that do not follow each other, or whose own header differs from the directory."""
         found: list[str] = []
         position = 0
         for info, name in sorted(zip(infos, names), key=_offset):  # noqa: B905 - not in 3.9
@@ -441,7 +441,7 @@ def _entry_problem(info: zipfile.ZipInfo) -> str:
 
 
 def _stream_problem(stream: IO[bytes], info: zipfile.ZipInfo) -> str:
-    """Why the bytes of an entry are not exactly its content, with nothing behind it; "" if they are."""
+    """Return why the bytes of an entry are not exactly its content, with nothing behind it; "" if they are."""
     if info.compress_type == zipfile.ZIP_STORED:
         return "" if info.compress_size == info.file_size else "it is stored with another size than it has"
     stream.seek(info.header_offset + 26)
@@ -576,7 +576,7 @@ class Check:
         return digest.hexdigest()
 
     def records(self, bundle: Bundle, name: str, whole: frozenset[str]) -> Iterator[dict[str, Any]]:
-        """The lines of a file of records, each canonical JSON."""
+        """Yield the lines of a file of records, each canonical JSON."""
         if name not in whole:
             return
         try:
@@ -923,7 +923,7 @@ def _heads(value: Any) -> dict[str, tuple[int, str]]:
 
 
 def references_in(value: Any) -> Iterator[dict[str, Any]]:
-    """Every reference to a file anywhere within a payload."""
+    """Yield every reference to a file anywhere within a payload."""
     if isinstance(value, dict):
         if value.keys() == REFERENCE:
             yield value
@@ -999,7 +999,7 @@ class DerValue:
         self.whole = data[start : self.end]
 
     def children(self) -> list[DerValue]:
-        """The values within."""
+        """Return the values within."""
         found: list[DerValue] = []
         at = 0
         while at < len(self.content):
@@ -1008,7 +1008,7 @@ class DerValue:
         return found
 
     def oid(self) -> str:
-        """An object identifier as text."""
+        """Return an object identifier as text."""
         numbers = [self.content[0] // 40, self.content[0] % 40]
         value = 0
         for byte in self.content[1:]:
@@ -1109,7 +1109,7 @@ def _digest(algorithm: str, message: bytes) -> bytes:
 
 
 def load_certificates(path: Path | None) -> list[x509.Certificate]:
-    """The certificates of a PEM file. Raises NotABundleError."""
+    """Return the certificates of a PEM file. Raises NotABundleError."""
     if path is None:
         return []
     try:
@@ -1160,7 +1160,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def report(check: Check) -> str:
-    """The result in words."""
+    """Return the result in words."""
     counts = check.counts
     simulated = " SIMULATED: no real device took part." if check.manifest["simulated"] else ""
     lines = [

@@ -153,7 +153,7 @@ def _table(dataset: DataSet, pairs: list[ListedPair]) -> bytes:
 
 
 def _sigma(covariance: NDArray[np.float64]) -> float:
-    """Expected length of an error in space with this covariance (3, 3)."""
+    """Return the expected length of an error in space with this covariance (3, 3)."""
     return float(np.sqrt(np.trace(covariance)))
 
 

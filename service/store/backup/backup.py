@@ -250,7 +250,10 @@ class _Backup:
             )
 
     def _missing(self, sizes: dict[str, int]) -> list[str]:
-        """Hashes of the files to copy. Removes damaged copies, of wrong size or, with `read_all`, wrong content."""
+        """Return hashes of the files to copy.
+
+        Removes damaged copies, of wrong size or, with `read_all`, wrong content.
+        """
         found: list[str] = []
         total, done = sum(sizes.values()), 0
         for sha256, size in sizes.items():

@@ -130,16 +130,19 @@ class BackupFolder:
             yield
 
     def states(self) -> list[str]:
-        """Names of the complete backups, oldest first."""
+        """Return names of the complete backups, oldest first."""
         found = (self.folder / STATES).glob(f"*/{STATE_FILE}")
         return sorted(path.parent.name for path in found if path.parent.suffix != PART)
 
     def path(self, name: str) -> Path:
-        """The folder of a state, which need not exist."""
+        """Return the folder of a state, which need not exist."""
         return self.folder / STATES / name
 
     def read(self, name: str) -> BackupState:
-        """The record of a state. Raises StoreError if there is no such state, IntegrityError if it is unreadable."""
+        """Return the record of a state.
+
+        Raises StoreError if there is no such state, IntegrityError if it is unreadable.
+        """
         if name not in self.states():
             raise StoreError(
                 f"there is no backup {name!r} here" if name else "there is no complete backup here",

@@ -47,19 +47,19 @@ _MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alemb
 
 
 def database_path(data_dir: Path) -> Path:
-    """The path of a data folder's database."""
+    """Return the path of a data folder's database."""
     return data_dir / DATABASE_NAME
 
 
 def read_schema(connection: Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
-    """The schema of this database in the form of `fresh_schema`: (type, name) → (table, SQL)."""
+    """Return the schema of this database in the form of `fresh_schema`: (type, name) → (table, SQL)."""
     made = connection.execute(text("SELECT type, name, tbl_name, sql FROM sqlite_master"))
     return {(str(row.type), str(row.name)): (str(row.tbl_name), row.sql) for row in made}
 
 
 @cache
 def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
-    """The schema of a new database of this version: (type such as table or index, name) → (table, SQL)."""
+    """Return the schema of a new database of this version: (type such as table or index, name) → (table, SQL)."""
     engine = create_engine("sqlite://")
     try:
         with engine.begin() as connection:
@@ -102,13 +102,13 @@ class Database:
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
-        """A read transaction: one consistent snapshot. Raises StoreError."""
+        """Yield a read transaction: one consistent snapshot. Raises StoreError."""
         with _store_errors(self._path), self._engine.connect() as connection, connection.begin():
             yield connection
 
     @contextmanager
     def writing(self) -> Generator[Connection]:
-        """A write transaction: commits through `Files` at the end, rolls back on any exception.
+        """Yield a write transaction: commits through `Files` at the end, rolls back on any exception.
 
         What it changes is in the journal before it is committed. Nothing is committed, and so nothing is signed,
         unless what was recorded before is still there.
@@ -194,7 +194,7 @@ class Database:
         return held
 
     def _looked_up(self, *, closely: bool) -> int:
-        """The number of the journal's line that the database holds, as a new connection finds it.
+        """Return the number of the journal's line that the database holds, as a new connection finds it.
 
         This one reads pages of the file that other connections only remember, and each commit writes the number.
         Looked at closely, the last events that were written here must still be there, too. If the file itself has

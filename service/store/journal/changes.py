@@ -70,7 +70,7 @@ def changed_rows(connection: sqlite3.Connection) -> list[RowImage]:
 
 
 def every_row(connection: sqlite3.Connection) -> Iterator[RowImage]:
-    """All rows that the journal keeps, events in the order in which they were written."""
+    """Yield all rows that the journal keeps, events in the order in which they were written."""
     for name in KEPT:
         columns = ", ".join(f"t.{column}" for column in _COLUMNS[name])
         order = _ORDER.get(name, ", ".join(_KEYS[name]))
@@ -89,12 +89,12 @@ def is_known(row: RowImage) -> bool:
 
 
 def key_of(row: RowImage) -> tuple[str, tuple[Value, ...]]:
-    """The table and the primary key of a row. Raises KeyError for a table that the journal does not keep."""
+    """Return the table and the primary key of a row. Raises KeyError for a table that the journal does not keep."""
     return row.table, tuple(row.values[column] for column in _KEYS[row.table])
 
 
 def row_of_key(table: str, key: Sequence[Value]) -> RowImage:
-    """A row of which only the key is known."""
+    """Return a row of which only the key is known."""
     return RowImage(table, dict(zip(_KEYS[table], key, strict=True)))
 
 

@@ -133,7 +133,7 @@ def survey(path: Path) -> Survey:
 
 
 def committed_rows(path: Path, surveyed: Survey, until: int) -> Iterator[RowImage]:
-    """The rows of all committed lines up to number `until` that are as they were written, in their order."""
+    """Yield the rows of all committed lines up to number `until` that are as they were written, in their order."""
     left_out = surveyed.void | {number for number, _ in surveyed.problems}
     for item in read_lines(path):
         if isinstance(item, JournalLine) and 0 < item.number <= until and item.number not in left_out:
@@ -149,7 +149,7 @@ _Key = tuple[str, tuple[Value, ...]]
 def journal_findings(
     data_dir: Path, connection: Connection, run_ids: Sequence[str] | None, held_now: Callable[[], int]
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between a database and its journal.
+    """Return faults and notes on differences between a database and its journal.
 
     Args:
         data_dir: the data folder.

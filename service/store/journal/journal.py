@@ -76,7 +76,7 @@ class Journal:
         self._known: Tail | None = None
 
     def tail(self) -> Tail | None:
-        """The end of the journal; None if there is no line yet.
+        """Return the end of the journal; None if there is no line yet.
 
         Raises:
             RecordDamagedError: the file is not the one that this process has read or written before.
@@ -184,7 +184,7 @@ class Journal:
 
 
 def _beginning(rows: Iterable[RowImage], earlier_events: int, last: list[Tail]) -> Iterator[bytes]:
-    """The lines of a beginning; the tail that they make is put into `last`, but for its place."""
+    """Yield the lines of a beginning; the tail that they make is put into `last`, but for its place."""
     previous, end = FIRST, 0
     for number, (block, following) in enumerate(pairwise(chain(_blocks(rows), (None,))), start=1):
         earlier = earlier_events if number == 1 else 0
@@ -217,7 +217,7 @@ def _locked(path: Path) -> Generator[int]:
 
 
 def read_tail(path: Path) -> Tail | None:
-    """The end of any journal, such as a copy; None if the file has no line or does not exist.
+    """Return the end of any journal, such as a copy; None if the file has no line or does not exist.
 
     Raises RecordDamagedError if a line near the end does not follow the one before it, OSError.
     """
@@ -230,7 +230,7 @@ def read_tail(path: Path) -> Tail | None:
 
 
 def _last(descriptor: int, size: int, place: tuple[int, int]) -> Tail | None:
-    """The tail of a file that was not read before, from its end; None if it has no line."""
+    """Return the tail of a file that was not read before, from its end; None if it has no line."""
     length = _BLOCK_BYTES
     while True:
         begin = max(0, size - length)
@@ -252,7 +252,7 @@ def _tail_in(content: bytes, offset: int, place: tuple[int, int]) -> Tail | None
 
 
 def _following(descriptor: int, known: Tail) -> Tail | None:
-    """The tail of a file that has grown since; None if the last line that is known is not there any more."""
+    """Return the tail of a file that has grown since; None if the last line that is known is not there any more."""
     content = os.pread(descriptor, max(0, os.fstat(descriptor).st_size - known.start), known.start)
     lines = _split(content)
     if not lines or hashlib.sha256(lines[0]).hexdigest() != known.sha256:
@@ -266,7 +266,7 @@ def _following(descriptor: int, known: Tail) -> Tail | None:
 
 
 def _split(content: bytes) -> list[bytes]:
-    """The pieces of the file, each up to and with its line end."""
+    """Return the pieces of the file, each up to and with its line end."""
     *whole, rest = content.split(b"\n")
     pieces = [piece + b"\n" for piece in whole]
     return [*pieces, rest] if rest else pieces

@@ -91,7 +91,7 @@ class LineFields:
 
 
 def line_bytes(fields: LineFields, rows: Sequence[RowImage]) -> bytes:
-    """The bytes of a line."""
+    """Return the bytes of a line."""
     data: dict[str, Any] = {
         "number": fields.number,
         "after": fields.after,
@@ -106,12 +106,12 @@ def line_bytes(fields: LineFields, rows: Sequence[RowImage]) -> bytes:
 
 
 def mark_bytes(mark: Mark) -> bytes:
-    """The bytes of a mark."""
+    """Return the bytes of a mark."""
     return _JSON.encode({"mark": mark.word, "number": mark.number, "sha256": mark.sha256}).encode() + b"\n"
 
 
 def parse_line(raw: bytes, end: int) -> JournalLine:
-    """A line from its bytes, which end at this offset of the file, with what is wrong with it."""
+    """Return a line from its bytes, which end at this offset of the file, with what is wrong with it."""
     sha256 = hashlib.sha256(raw).hexdigest()
     try:
         data: Any = json.loads(raw)
@@ -140,7 +140,7 @@ def _row(item: Any) -> RowImage:
 
 
 def parse_mark(raw: bytes) -> Mark | None:
-    """A mark from its bytes; None if these are not exactly those of a mark."""
+    """Return a mark from its bytes; None if these are not exactly those of a mark."""
     try:
         data: Any = json.loads(raw)
         mark = Mark(data["mark"], int(data["number"]), str(data["sha256"]))
@@ -150,7 +150,7 @@ def parse_mark(raw: bytes) -> Mark | None:
 
 
 def read_lines(path: Path) -> Iterator[JournalLine | Ending]:
-    """Every line in order, then the ending; nothing for a file that does not exist. Raises StoreError.
+    """Yield every line in order, then the ending; nothing for a file that does not exist. Raises StoreError.
 
     An unreadable line with others after it is a line with a problem; at the end of the file it belongs to the ending.
     """
@@ -183,13 +183,13 @@ def _lines(stream: Iterable[bytes]) -> Iterator[JournalLine | Ending]:
 
 
 def first_lines(path: Path, number: int) -> Iterator[bytes]:
-    """The bytes of the first `number` lines, as they are, without a mark. Raises OSError."""
+    """Yield the bytes of the first `number` lines, as they are, without a mark. Raises OSError."""
     with path.open("rb") as stream:
         yield from islice((raw for raw in stream if parse_mark(raw) is None), number)
 
 
 def unreadable(path: Path, error: OSError) -> StoreError:
-    """The error for a journal that cannot be read."""
+    """Return the error for a journal that cannot be read."""
     return StoreError(
         f"the journal cannot be read: {error.strerror or error}",
         where=str(path),

@@ -192,7 +192,7 @@ def _named_with_a_copy(data_dir: Path, actor: Callable[[Path], str], files: File
 
 @contextmanager
 def _work_folder(data_dir: Path, files: Files) -> Generator[Path]:
-    """A folder within the data folder that has its keys, and is gone afterwards."""
+    """Yield a folder within the data folder that has its keys, and is gone afterwards."""
     work = data_dir / _WORK
     shutil.rmtree(work, ignore_errors=True)  # of an interrupted rebuild
     files.make_directory(work, private=True)

@@ -135,7 +135,7 @@ class SignatureLog:
             raise _unwritten(self.path, error) from error
 
     def lines_after(self, end: LogEnd) -> tuple[list[LogLine], LogEnd] | None:
-        """The lines after a place, and where the last of them ends.
+        """Return the lines after a place, and where the last of them ends.
 
         None if there is no log, or the line before that place is no longer there. Raises StoreError if it cannot be
         read.
@@ -183,8 +183,8 @@ def power_cut_explains(missing: Sequence[Checkpoint], newest: int) -> bool:
 def copying_alone(log: Path) -> Generator[None]:
     """Wait until no other process writes to the second place of this log, and keep them waiting.
 
-    Signatures do not wait for it: a lock of the folder serialises them (SignatureLog.alone). Before the first signature
-    there is nothing to wait for. Raises StoreError if the log cannot be read.
+    Signatures do not wait for it: a lock of the folder serialises them (SignatureLog.alone). Before the first
+    signature there is nothing to wait for. Raises StoreError if the log cannot be read.
     """
     try:
         descriptor = os.open(log, os.O_RDONLY | os.O_CLOEXEC)
@@ -201,7 +201,7 @@ def copying_alone(log: Path) -> Generator[None]:
 
 
 def unreadable(path: Path, error: OSError) -> StoreError:
-    """The error of a log of signatures, or of a copy of it, that cannot be read."""
+    """Return the error of a log of signatures, or of a copy of it, that cannot be read."""
     return StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK)
 
 
@@ -214,13 +214,13 @@ def _unwritten(path: Path, error: OSError) -> StoreError:
 
 
 def read_log(path: Path) -> list[LogLine] | None:
-    """The lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
+    """Return the lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
     content = _content(path, 0)
     return None if content is None else [line for line, _ in _parsed(content, LogEnd())]
 
 
 def _content(path: Path, offset: int) -> bytes | None:
-    """The log from an offset on; None if the file does not exist. Raises StoreError."""
+    """Return the log from an offset on; None if the file does not exist. Raises StoreError."""
     try:
         with path.open("rb") as stream:
             stream.seek(offset)
@@ -232,7 +232,7 @@ def _content(path: Path, offset: int) -> bytes | None:
 
 
 def _parsed(content: bytes, end: LogEnd) -> Iterator[tuple[LogLine, LogEnd]]:
-    """The lines that follow a place, each with its own end."""
+    """Yield the lines that follow a place, each with its own end."""
     # A line without a line end was cut off by a power failure and was never reported as written.
     whole = content[: content.rfind(b"\n") + 1]
     for raw in whole.splitlines(keepends=True):
@@ -408,7 +408,7 @@ class SeenSignatures:
             self.key_id, self._keys_until = self.key_in_use(connection), connection.execute(_HEAD).scalar() or 0
 
     def made_since(self, connection: Connection) -> list[Checkpoint]:
-        """The checkpoints that were made since the last look, oldest first."""
+        """Return the checkpoints that were made since the last look, oldest first."""
         return [to_checkpoint(row) for row in connection.execute(_NEW.where(self._last[0] < _ROWID))]
 
     def fault(self, run_id: str) -> Fault | None:
@@ -449,7 +449,7 @@ class SeenSignatures:
         self.missing = tuple(awaited.values())
 
     def key_in_use(self, connection: Connection) -> str:
-        """Fingerprint of the key in use; "" before the first signature."""
+        """Return the fingerprint of the key in use; "" before the first signature."""
         found = self.key_id
         for row in connection.execute(_KEYS.where(events.c.seq > self._keys_until).order_by(events.c.seq)):
             try:

@@ -240,7 +240,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def journal_copy(signature_copy: Path) -> Path:
-    """The path of the copy of the journal, from that of the copy of the log of signatures."""
+    """Return the path of the copy of the journal, from that of the copy of the log of signatures."""
     return signature_copy.with_name(f"{signature_copy.stem}.{JOURNAL_NAME}")
 
 
@@ -299,7 +299,7 @@ class JournalCopy:
 
 
 def journal_copy_faults(data_dir: Path, copy: Path) -> Iterator[Fault]:
-    """Faults of the journal that its copy shows; none if there is no copy. Raises StoreError.
+    """Yield faults of the journal that its copy shows; none if there is no copy. Raises StoreError.
 
     Each line holds the hash of the one before it, so the copy's last line stands for all of them.
     """

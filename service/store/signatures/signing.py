@@ -128,7 +128,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
 
 
 def sign(store: Store, message: bytes) -> tuple[str, str]:
-    """Fingerprint of the key in use, and its signature over a message in base64. Raises SigningKeyError.
+    """Return the fingerprint of the key in use, and its signature over a message in base64. Raises SigningKeyError.
 
     The message must begin with its purpose, so that the signature cannot be used for anything else.
     """
@@ -138,7 +138,7 @@ def sign(store: Store, message: bytes) -> tuple[str, str]:
 
 
 def public_keys(store: Store) -> list[PublicKey]:
-    """Every key that has signed in this data folder, oldest first; the last one is in use."""
+    """Return every key that has signed in this data folder, oldest first; the last one is in use."""
     with store.database.reading() as connection:
         changes = read_key_changes(connection)
         signed = {item.seq: item for item in read_checkpoints(connection, SITE)}
@@ -218,7 +218,7 @@ def _require_lost(connection: Connection, folder: KeyFolder) -> None:
 
 
 def _present_key(store: Store, connection: Connection) -> Ed25519PrivateKey:
-    """The key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
+    """Return the key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
     folder = KeyFolder(store.database_path.parent, store.files)
     key_id = store.seen_signatures.key_in_use(connection)
     if key_id:
@@ -247,7 +247,7 @@ def _record_key(
 
 
 def _signed_end(connection: Connection, run_id: str) -> Checkpoint | None:
-    """The checkpoint of a chain's last event; None if that event is not signed."""
+    """Return the checkpoint of a chain's last event; None if that event is not signed."""
     last = last_checkpoint(connection, run_id)
     return last if last is not None and (last.seq, last.sha256) == read_head(connection, run_id) else None
 

@@ -154,7 +154,10 @@ class ChainRows:
 def run_faults(
     run_id: str, rows: ChainRows, files: Mapping[str, FileState] | None, facts: ChainFacts
 ) -> Iterator[Fault]:
-    """Every fault of one run: first by event, then of the run as a whole. Fills `facts`; `files` None: not read."""
+    """Yield every fault of one run: first by event, then of the run as a whole.
+
+    Fills `facts`; `files` None: not read.
+    """
     by_seq: dict[int, list[Mapping[str, Any]]] = {}
     for row in rows.artefacts:
         by_seq.setdefault(int(row["seq"]), []).append(row)
@@ -185,7 +188,7 @@ def run_faults(
 def chain_fault(
     run_id: str, event_rows: Iterable[Mapping[Any, Any]], end: tuple[int, str]
 ) -> Fault | tuple[int, str]:
-    """The first fault in the events that follow `end` (seq, sha256), or the new end of the chain."""
+    """Return the first fault in the events that follow `end` (seq, sha256), or the new end of the chain."""
     seq, previous = end
     for row in event_rows:
         for fault in _link_faults(run_id, row, seq, previous):
@@ -341,7 +344,7 @@ def _end_of_job_faults(
 
 
 def summary(payload: Mapping[str, Any]) -> str:
-    """One line on an event's payload: its scalar fields in order, long ones cut."""
+    """Return one line on an event's payload: its scalar fields in order, long ones cut."""
     parts = [
         f"{name}={value}"
         for name, value in payload.items()

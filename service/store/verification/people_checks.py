@@ -21,7 +21,10 @@ _LOCKS = {"screen_locked": 1, "screen_unlocked": 0}
 
 
 def session_sha256(row: Mapping[str, Any]) -> str:
-    """SHA-256 of the columns of a session that never change. (A flipped bit may have turned text into bytes.)"""
+    """Return the SHA-256 of the columns of a session that never change.
+
+    (A flipped bit may have turned text into bytes.)
+    """
     values = {name: row[name] for name in _SESSION}
     return sha256_text(canonical({k: str(v) if isinstance(v, bytes) else v for k, v in values.items()}))
 
@@ -92,7 +95,7 @@ class _RecordedAccounts:
 def people_faults(
     events: Iterable[tuple[Mapping[str, Any], str]], accounts: Rows, links: Rows, sessions: Rows
 ) -> Iterator[Fault]:
-    """Rows that do not agree with the site's chain. What older chains do not record is not a fault.
+    """Yield rows that do not agree with the site's chain. What older chains do not record is not a fault.
 
     Args:
         events: (payload, time) of account_changed and sign_in_recorded, oldest first.

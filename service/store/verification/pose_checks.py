@@ -75,7 +75,7 @@ class PoseFacts:
             self._away[seq] = AwayView(seq, view.viewpoint, *min(gaps))
 
     def findings(self, run_id: str) -> tuple[list[AwayView], list[str]]:
-        """Views whose newest image has a wrong pose, and notes on those that were taken again since."""
+        """Return views whose newest image has a wrong pose, and notes on those that were taken again since."""
         newest = set(self._last.values())
         faults = [away for seq, away in self._away.items() if seq in newest]
         return faults, list(self._notes(run_id, newest))

@@ -34,7 +34,7 @@ class Keys:
 
 
 def key_history(site: ChainFacts, checkpoints: Sequence[Checkpoint]) -> Keys:
-    """The keys in the site's chain; `checkpoints` are the site's.
+    """Return the keys in the site's chain; `checkpoints` are the site's.
 
     A new key counts as introduced if its predecessor signed its KeyChanged. Otherwise a note says so: the old key may
     have been lost, and only a fingerprint written down elsewhere distinguishes the new key from an intruder's.
@@ -73,7 +73,7 @@ def checkpoint_faults(
     keys: Mapping[str, KeyPeriod],
     artefact_rows: Sequence[Mapping[str, Any]],
 ) -> Iterator[Fault]:
-    """Every fault of a run's checkpoints, given oldest first; `artefact_rows` in the order of the events."""
+    """Yield every fault of a run's checkpoints, given oldest first; `artefact_rows` in the order of the events."""
     digest, position = RowsDigest(), 0
     for item in checkpoints:
         while position < len(artefact_rows) and int(artefact_rows[position]["seq"]) <= item.seq:
@@ -125,7 +125,7 @@ def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[F
 def stamp_faults(
     site: ChainFacts, signed: Mapping[str, Sequence[Checkpoint]], stamps: Mapping[str, Sequence[Timestamp]]
 ) -> Iterator[Fault]:
-    """Time stamps that differ from those recorded in the site's chain; `signed` and `stamps` are by run.
+    """Yield time stamps that differ from those recorded in the site's chain; `signed` and `stamps` are by run.
 
     Stamps of other runs, and stamps made before the site's chain recorded them, are not checked.
     """
@@ -163,7 +163,7 @@ def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, eve
 
 
 def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[Fault]:
-    """Events that are always signed at once (step passed, run ended) but have no signature: it was removed.
+    """Yield events that are always signed at once (step passed, run ended) but have no signature: it was removed.
 
     The last event may still be waiting for its signature, even if a worker has reported since.
     """
@@ -175,7 +175,7 @@ def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: C
 
 
 def late_signatures(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[str]:
-    """Notes on events that are always signed at once and have no signature of their own, only a later one.
+    """Yield notes on events that are always signed at once and have no signature of their own, only a later one.
 
     Signing may have failed then, or a signature may have been taken away, the events rewritten, and signed again.
     """
@@ -194,7 +194,7 @@ def late_signatures(run_id: str, checkpoints: Sequence[Checkpoint], chain: Chain
 
 
 def unsigned(run_id: str, checkpoints: Sequence[Checkpoint], events: int) -> tuple[int, str]:
-    """Number of events after the last checkpoint, and a note on them; (0, "") if there are none."""
+    """Return the number of events after the last checkpoint, and a note on them; (0, "") if there are none."""
     last = checkpoints[-1].seq if checkpoints else 0
     count = max(0, events - last)
     if count == 0:

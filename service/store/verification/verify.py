@@ -124,7 +124,7 @@ def verify(
 
 
 def _held_now(database: Database) -> int:
-    """The number of the journal's line that the database holds by now."""
+    """Return the number of the journal's line that the database holds by now."""
     with database.reading() as connection:
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
 
@@ -229,7 +229,7 @@ class _SignatureCheck:
     certificates: Path | None
 
     def findings(self, run: str, facts: ChainFacts) -> tuple[list[Fault], list[str]]:
-        """Faults and notes of one chain."""
+        """Return faults and notes of one chain."""
         signed = self.evidence.checkpoints[run]
         rows = self.evidence.artefacts.get(run, [])
         from service.store.signatures.timestamps import (  # noqa: PLC0415 - X.509, which only a verification needs
@@ -257,7 +257,7 @@ class _SignatureCheck:
 
 
 def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
-    """Faults of the schema and of what is derived from the events: references, indexes, queue, words."""
+    """Yield faults of the schema and of what is derived from the events: references, indexes, queue, words."""
     yield from derived.schema_faults(connection)
     yield from derived.reference_faults(connection)
     yield from derived.index_faults(connection, runs, every_run=every_run)
@@ -268,7 +268,7 @@ def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: b
 def _counted(
     data_dir: Path, evidence: EvidenceRows, chains: Mapping[str, ChainFacts], files: Mapping[str, FileState]
 ) -> AuditReport:
-    """The figures of a report, without faults and notes."""
+    """Return the figures of a report, without faults and notes."""
     events = {run: len(chains[run].sha256_at) for run in evidence.run_ids}
     signed = evidence.checkpoints
     return AuditReport(
@@ -290,7 +290,7 @@ def _counted(
 
 
 def show(data_dir: Path, run_id: str) -> list[EvidenceRecord]:
-    """The events of a run, oldest first. Raises UnknownRunError, StoreError."""
+    """Return the events of a run, oldest first. Raises UnknownRunError, StoreError."""
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:
@@ -318,7 +318,7 @@ def show(data_dir: Path, run_id: str) -> list[EvidenceRecord]:
 
 
 def list_runs(data_dir: Path) -> list[RunRow]:
-    """All runs of a data folder, oldest first, read-only. Raises StoreError."""
+    """Return all runs of a data folder, oldest first, read-only. Raises StoreError."""
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:

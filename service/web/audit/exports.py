@@ -279,7 +279,7 @@ def _may_stop(exports: Exports, person: Person, run_id: str) -> bool:
 
 
 def _lines(text: str) -> tuple[str, ...]:
-    """The lines that are not empty."""
+    """Return the lines that are not empty."""
     return tuple(filter(None, (line.strip() for line in text.splitlines())))
 
 

@@ -67,7 +67,7 @@ class AccuracyRow:
     response_class=HTMLResponse,
 )
 def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """Every gate of every step, in the order of the protocol."""
+    """Show every gate of every step, in the order of the protocol."""
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
     return render(
@@ -80,7 +80,7 @@ def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
 
 
 def gates_of(digest: Digest) -> list[StepGates]:
-    """The steps that have gates."""
+    """Return the steps that have gates."""
     protocol, state = digest.protocol, digest.state
     if protocol is None or state is None:
         return []
@@ -106,7 +106,7 @@ def _explained(protocol: Protocol, step: Step, now: StepState, skipped: frozense
 
 
 def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:
-    """The accuracy on the control spheres of every source of poses; empty before the evaluation."""
+    """Return the accuracy on the control spheres of every source of poses; empty before the evaluation."""
     if digest is None or digest.protocol is None or digest.state is None:
         return []
     return _accuracy(digest.protocol, digest.state)
@@ -142,7 +142,7 @@ def _accuracy(protocol: Protocol, state: RunState) -> list[AccuracyRow]:
     response_class=HTMLResponse,
 )
 def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """Devices with versions, clocks, troubles; sessions and software."""
+    """Show devices with versions, clocks, troubles; sessions and software."""
     frame = audit_frame(audit, run_id, "/devices")
     with audit.site.store.database.reading() as connection:
         opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))

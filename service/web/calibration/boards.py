@@ -69,7 +69,7 @@ _KEPT = TypeAdapter(tuple[PoseAdvice, ...])
 
 
 def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]]:
-    """The ninths of the image in which cells hold no corner, worst first: name, such cells, all cells."""
+    """Return the ninths of the image in which cells hold no corner, worst first: name, such cells, all cells."""
     grid = np.array(corners)
     out: list[tuple[str, int, int]] = []
     for r, rows in enumerate(np.array_split(np.arange(grid.shape[0]), 3)):
@@ -142,7 +142,7 @@ def _advise(
 
 
 def _advice(pose: SuggestedPose, T_board_camera: Transform, middle_m: Array) -> PoseAdvice:
-    """A suggested pose as a person can follow it; `middle_m` (3,) is the middle of the board, in its frame."""
+    """Return a suggested pose as a person can follow it; `middle_m` (3,) is the middle of the board, in its frame."""
     away = T_board_camera[:3, 3] - middle_m
     axis, top = T_board_camera[:3, 2], -T_board_camera[:3, 1]
     x, y, z = (mm(float(v)) for v in pose.T_base_flange[:3, 3])
@@ -249,7 +249,7 @@ def _text(
 
 
 def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
-    """The plan as an SVG document, computed once for each recorded state of a step.
+    """Return the plan as an SVG document, computed once for each recorded state of a step.
 
     Raises:
         ProtocolError: no such step.

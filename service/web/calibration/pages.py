@@ -122,7 +122,7 @@ def board_plan(site: CurrentSite, run_id: RunId, step: Annotated[str, Query(max_
     dependencies=[Depends(requires("read"))],
 )
 def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
-    """The calibration on a page to print."""
+    """Show the calibration on a page to print."""
     log = site.run(run_id)
     found = calibration_of(log)
     if found is None:
@@ -144,7 +144,7 @@ def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
 def _rendered(
     request: Request, template: str, page: CalibrationPage | CertificatePage, frame: RunFrame
 ) -> HTMLResponse:
-    """A page with the words for measures and gates."""
+    """Return a page with the words for measures and gates."""
     return render(
         request,
         template,
@@ -165,7 +165,7 @@ def _depends(log: RunRecord, found: Calibration) -> list[AcceptedGate]:
 def _advice(
     site: Site, log: RunRecord, found: Calibration
 ) -> tuple[list[tuple[str, int, int]], tuple[PoseAdvice, ...]]:
-    """Parts of the image without corners, and board poses worth taking."""
+    """Return parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.boards import advised_poses, empty_regions  # noqa: PLC0415
 

@@ -76,7 +76,7 @@ class Charts:
 
 
 def calibration_of(log: RunRecord) -> Calibration | None:
-    """The calibration in force; None before a calibration step has an answer."""
+    """Return the calibration in force; None before a calibration step has an answer."""
     solved = [
         (step, log.state.steps[step.id])
         for step in log.protocol.steps
@@ -114,13 +114,13 @@ class _Robots(BaseModel):
 
 
 def _board_images(log: RunRecord, step: Step) -> tuple[RecordedView, ...]:
-    """The valid board images that a calibration step used: its own, or those of an earlier step."""
+    """Return the valid board images that a calibration step used: its own, or those of an earlier step."""
     source = step.params_as(Params).images_of or step.id
     return tuple(capture.payload for capture in captures_of(log, source) if capture.replaced is None)
 
 
 def charts_of(calibration: Calibration) -> Charts | None:
-    """The charts of the intrinsics; None if they are not solved."""
+    """Return the charts of the intrinsics; None if they are not solved."""
     record = calibration.intrinsics
     if record is None or record.coverage is None or record.residuals is None or record.uncertainty is None:
         return None
@@ -175,7 +175,7 @@ def hand_eye_chart(calibration: Calibration) -> DotPlot | None:
 
 
 def image_rows(calibration: Calibration) -> list[ImageRow]:
-    """Every board image with its residuals, unused images first."""
+    """Return every board image with its residuals, unused images first."""
     record = calibration.intrinsics or Intrinsics()
     validation = record.cross_validation
 
@@ -265,7 +265,7 @@ class Certificate:
 
 
 def _later_checks(log: RunRecord, calibrated: set[str]) -> list[LaterCheck]:
-    """The steps outside the calibration that compared their images with it."""
+    """Return the steps outside the calibration that compared their images with it."""
     steps = [(step, log.state.steps[step.id]) for step in log.protocol.steps if step.id not in calibrated]
     return [
         LaterCheck(step.title, len(done.captured), int(done.measures["optics_departures"]))
@@ -275,7 +275,7 @@ def _later_checks(log: RunRecord, calibrated: set[str]) -> list[LaterCheck]:
 
 
 def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
-    """The certificate, from the recorded events alone."""
+    """Return the certificate, from the recorded events alone."""
     state, (_, there) = log.state, calibration.steps[-1]
     first = calibration.captures[0] if calibration.captures else None
     ids = {step.id for step, _ in calibration.steps}

@@ -81,7 +81,7 @@ def run_file(
     sha256: Sha256,
     thumbnail: Annotated[int | None, Query(ge=64, le=640)] = None,
 ) -> Response:
-    """A file of this run's evidence, hashed again before it is sent; or a small copy of a picture."""
+    """Show a file of this run's evidence, hashed again before it is sent; or a small copy of a picture."""
     ref = recorded_file(site, run_id, sha256)
     tag = f'"{sha256}{"" if thumbnail is None else f"-{nearest_width(thumbnail)}"}"'
     if request.headers.get("if-none-match") == tag:
@@ -135,7 +135,7 @@ def viewpoint_image(
     viewpoint: Viewpoint,
     wanted: Annotated[ImageQuery, Query()],
 ) -> Response:
-    """A copy of a viewpoint's image for the screen."""
+    """Show a copy of a viewpoint's image for the screen."""
     log = site.run(run_id)
     capture = find_capture(log, viewpoint, step=wanted.step, attempt=wanted.attempt, seq=wanted.seq)
     if capture is None:
@@ -151,7 +151,7 @@ def viewpoint_image(
 
 
 def _photograph(log: RunRecord, capture: Capture, device: str) -> ArtefactRef:
-    """The photograph of a camera at a viewpoint. HTTP 404 if it did not expose there."""
+    """Return the photograph of a camera at a viewpoint. HTTP 404 if it did not expose there."""
     if not device:
         return capture.payload.artefacts[0]
     for one in further_of(log, capture):
@@ -168,7 +168,7 @@ def _photograph(log: RunRecord, capture: Capture, device: str) -> ArtefactRef:
     response_class=FileResponse,
 )
 def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max_length=64)] = "") -> Response:
-    """A camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
+    """Show a camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
     if camera and camera not in rig_cameras(site.run(run_id)):
         raise HTTPException(404, "the rig of this run has no further camera of this name")
     site.run(run_id)
@@ -218,7 +218,10 @@ class _Marks:
 
 
 def _reduced(site: Site, ref: ArtefactRef, width: int, drawn: _Marks | None = None) -> Path:
-    """The cached copy. HTTP 415 if the file is not a picture; the original is hashed again when a copy is made."""
+    """Return the cached copy.
+
+    HTTP 415 if the file is not a picture; the original is hashed again when a copy is made.
+    """
     if ref.media_type not in PICTURES:
         raise HTTPException(415, f"{safe_name(ref.original_name, ref.sha256)} is not a picture")
 

@@ -142,7 +142,7 @@ class CapturePage:
 def capture(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, wanted: Wanted
 ) -> HTMLResponse:
-    """Everything about the images of one step."""
+    """Show everything about the images of one step."""
     shown = _shown(site, person, run_id, wanted)
     return render(request, "capture/capture.html.j2", shown, frame=run_frame(site, run_id))
 
@@ -151,7 +151,7 @@ def capture(
 def capture_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, wanted: Wanted
 ) -> HTMLResponse:
-    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
+    """Show parts of the page, all from the same moment, for the script that keeps the page up to date."""
     shown = _shown(site, person, run_id, wanted)
     return render(request, "capture/parts.html.j2", shown, names=names.split(","))
 
@@ -205,7 +205,7 @@ def _of_step(site: Site, person: Person, log: RunRecord, step: Step, wanted: Cap
 
 
 def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None:
-    """The image of an event, else the newest valid one of the viewpoint, else the newest valid one."""
+    """Return the image of an event, else the newest valid one of the viewpoint, else the newest valid one."""
     by_event = next((c for c in captures if wanted.seq and c.seq == wanted.seq), None)
     if by_event is not None:
         return by_event
@@ -215,7 +215,7 @@ def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None
 
 
 def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) -> ViewTable:
-    """A page of the table: the one asked for, or the one with the viewpoint that is shown or comes next."""
+    """Return a page of the table: the one asked for, or the one with the viewpoint that is shown or comes next."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
 
     pages = max(1, -(-len(views) // LISTED))
@@ -232,7 +232,7 @@ def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) ->
 
 
 def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> ContactSheet:
-    """A page of the contact sheet: images with something wrong first, then newest first."""
+    """Return a page of the contact sheet: images with something wrong first, then newest first."""
     from service.web.capture.view import devices_in, sheet_image  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
@@ -257,7 +257,7 @@ def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: Capt
 def _image(
     log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture], device: str
 ) -> ChosenImage:
-    """The large image, with what is known about it."""
+    """Return the large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
     from service.web.capture.view import camera_images  # noqa: PLC0415
     from service.web.record.outlines import displayed_registration  # noqa: PLC0415
@@ -276,7 +276,7 @@ def _image(
 
 
 def _drawings(log: RunRecord, views: Sequence[StepViewpoint], name: str) -> list[PlanDrawing]:
-    """The plan of the viewpoints of each known station."""
+    """Return the plan of the viewpoints of each known station."""
     from service.web.capture import plan_drawing  # noqa: PLC0415
     from service.web.record import planned_poses  # noqa: PLC0415
 

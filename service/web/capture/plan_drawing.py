@@ -54,7 +54,7 @@ class PlanDrawing:
 
 
 def plan_drawing(station: StationPlan, views: Sequence[StepViewpoint], chosen: str = "") -> PlanDrawing | None:
-    """The drawing; None without a viewpoint whose position is known. `chosen` is always drawn."""
+    """Return the drawing; None without a viewpoint whose position is known. `chosen` is always drawn."""
     placed = [(v, v.position_m, v.looks) for v in views if v.position_m is not None and v.looks is not None]
     if not placed:
         return None
@@ -111,7 +111,7 @@ def _short(name: str) -> str:
 
 
 def _above(point: Vector, origin: Vector, approach: Vector) -> tuple[float, float]:
-    """Metres to the right and down the page of a point seen from above, the robot below."""
+    """Return metres to the right and down the page of a point seen from above, the robot below."""
     x, y = point[0] - origin[0], point[1] - origin[1]
     side = (-approach[1], approach[0])  # up × approach
     return x * side[0] + y * side[1], x * approach[0] + y * approach[1]

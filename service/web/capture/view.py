@@ -101,7 +101,7 @@ class ViewpointRedo:
 
 
 def capture_steps(protocol: Protocol) -> list[Step]:
-    """The steps that take images with the robot."""
+    """Return the steps that take images with the robot."""
     return [
         step
         for step in protocol.steps
@@ -110,7 +110,7 @@ def capture_steps(protocol: Protocol) -> list[Step]:
 
 
 def views_of(log: RunRecord, step: Step) -> list[StepViewpoint]:
-    """Every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
+    """Return every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
     state = log.state.steps[step.id]
     planned = {v.name: v for v in planned_viewpoints(log, step)}
     refused = _refused(state)
@@ -396,7 +396,7 @@ def camera_images(
 
 
 def devices_in(log: RunRecord, captures: Sequence[Capture]) -> list[str]:
-    """The further cameras that took any of these images."""
+    """Return the further cameras that took any of these images."""
     return list(_by_device(log, captures))
 
 
@@ -409,7 +409,7 @@ def _by_device(log: RunRecord, captures: Sequence[Capture]) -> dict[str, list[Fu
 
 
 def sheet_image(log: RunRecord, capture: Capture, uses: Mapping[str, BoardUse], device: str) -> SheetImage | None:
-    """A capture as the contact sheet shows it; None if this further camera did not expose there."""
+    """Return a capture as the contact sheet shows it; None if this further camera did not expose there."""
     if device:
         mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
         return None if mine is None else _of_further(capture, mine)
@@ -430,7 +430,7 @@ def _of_further(capture: Capture, mine: FurtherCapture) -> SheetImage:
 
 
 def _word(capture: Capture, use: BoardUse | None) -> tuple[str, str, str]:
-    """Word, tone and reason for an image of the first camera."""
+    """Return the word, tone and reason for an image of the first camera."""
     if capture.replaced is not None:
         return "Replaced", "quiet", capture.replaced.reason
     if use is not None:

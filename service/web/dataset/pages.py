@@ -46,7 +46,7 @@ class Benchmark:
 
 
 def benchmark_of(data: Path, events: Sequence[Event]) -> Benchmark:
-    """The results in DIR/benchmark whose data set has the list of checksums that the run has recorded."""
+    """Return the results in DIR/benchmark whose data set has the list of checksums that the run has recorded."""
     exported = {e.payload.sha256 for e in events if isinstance(e.payload, EvidenceExported)}
     try:
         found = read_results(data / FOLDER) if exported else ()
@@ -82,7 +82,7 @@ class Previews:
         return found
 
     def making(self, run_id: str) -> ChildState | None:
-        """The progress or the outcome of making the preview; None before the first time."""
+        """Return the progress or the outcome of making the preview; None before the first time."""
         return self._children.state(run_id)
 
     def make(self, state: RunState) -> None:
@@ -95,7 +95,7 @@ class Previews:
         self._children.wait(run_id, timeout_s)
 
     def file(self, state: RunState, name: str) -> Path | None:
-        """A file of the preview; None for a name that it does not have."""
+        """Return a file of the preview; None for a name that it does not have."""
         path = self._folder(state) / name
         return path if FILE_NAME.fullmatch(name) and path.is_file() else None
 
@@ -163,7 +163,7 @@ class DataSetView:
 
 
 def data_set_view(preview: Preview, split: str, view: str) -> DataSetView:
-    """The page for a chosen split and view; the first of the split if the name is none of its views."""
+    """Return the page for a chosen split and view; the first of the split if the name is none of its views."""
     members = tuple(shown for shown in preview.views if split in shown.splits)
     names = [shown.name for shown in members]
     at = names.index(view) if view in names else 0
@@ -207,7 +207,7 @@ def data_set_page(
     split: Split = "dense",
     view: Annotated[str, Query(max_length=200)] = "",
 ) -> Response:
-    """Views, crops, depth, coverage and distances, as far as they are ready; the rest is made meanwhile."""
+    """Show views, crops, depth, coverage and distances, as far as they are ready; the rest is made meanwhile."""
     log = site.run(run_id)
     unfit = refuse_data_set(log.state)
     preview = None if unfit else previews.ready(log.state)
@@ -241,7 +241,7 @@ def make_preview(site: CurrentSite, previews: CurrentPreviews, run_id: RunId) ->
 def picture(
     site: CurrentSite, previews: CurrentPreviews, run_id: RunId, name: Annotated[str, UrlPath(max_length=80)]
 ) -> FileResponse:
-    """A picture of the preview."""
+    """Serve a picture of the preview."""
     path = previews.file(site.run(run_id).state, name)
     if path is None or path.suffix[1:] not in _TYPES:
         raise HTTPException(404, "the data set has no such picture")
@@ -258,7 +258,7 @@ def surface_frame(
     figure: Literal["coverage", "sources", "sigmas", "distances"],
     theme: Theme = "auto",
 ) -> HTMLResponse:
-    """A coloured surface alone, for its sandboxed frame."""
+    """Show a coloured surface alone, for its sandboxed frame."""
     path = previews.file(site.run(run_id).state, f"{figure}.json")
     if path is None:
         raise HTTPException(404, "this surface is not ready")

@@ -78,7 +78,7 @@ class HandheldView:
 
 
 def held_steps(protocol: Protocol) -> list[Step]:
-    """The steps in which a person holds the camera."""
+    """Return the steps in which a person holds the camera."""
     return [step for step in protocol.steps if step.by_hand]
 
 
@@ -133,7 +133,7 @@ def _overlay(here: Matrix, there: Matrix) -> Overlay:
 
 
 def _lowest(places: Sequence[hand_view.PlaceStatus]) -> float:
-    """Largest distance of a place from the vertical through the middle, metres."""
+    """Return the largest distance of a place from the vertical through the middle, metres."""
     radii = [math.hypot(p.T_level_camera[0][3], p.T_level_camera[1][3]) for p in places]
     return max([0.05, *radii])
 

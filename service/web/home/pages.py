@@ -76,7 +76,7 @@ class HomeQuery(BaseModel):
     result: str = Field("", max_length=200)
 
     def wanted(self) -> RunSearch:
-        """The search."""
+        """Return the search."""
         return RunSearch(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
 
 
@@ -87,7 +87,7 @@ def home(
     person: SignedInPerson,
     asked_for: Annotated[HomeQuery, Query()],
 ) -> HTMLResponse:
-    """The runs in progress, then those that have ended, newest first, or those that match a search.
+    """Show the runs in progress, then those that have ended, newest first, or those that match a search.
 
     Only the runs of the page shown are read whole.
     """
@@ -118,7 +118,7 @@ def home(
 
 @router.get("/robots", name="robots", dependencies=[Depends(requires("read"))])
 def robots(request: Request, site: CurrentSite, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
-    """The state of all robots that are being driven, for the script that keeps every page up to date."""
+    """Show the state of all robots that are being driven, for the script that keeps every page up to date."""
     return render(request, "page/robots.html.j2", others=driven_frames(site, but=but))
 
 
@@ -210,7 +210,7 @@ _KNOWN = 20  # entries of earlier runs that a field offers
 def start_form(
     request: Request, site: CurrentSite, person: SignedInPerson, protocol: Annotated[str, Query(max_length=200)]
 ) -> HTMLResponse:
-    """Fields of a new run of one protocol file; the site is filled in as in the run before."""
+    """Show fields of a new run of one protocol file; the site is filled in as in the run before."""
     if protocol not in {path.name for path in site.protocol_files()}:
         raise ConfigurationError(
             f"there is no protocol file {protocol!r}",
@@ -285,7 +285,7 @@ _OFFERED = 200  # runs to choose from
 def compare_page(
     request: Request, site: CurrentSite, run: Annotated[list[str] | None, Query(max_length=64)] = None
 ) -> HTMLResponse:
-    """Two runs, or the choice of two. Raises UnknownRunError."""
+    """Show two runs, or the choice of two. Raises UnknownRunError."""
     chosen = list(dict.fromkeys(run or []))
     comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]

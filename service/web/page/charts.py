@@ -175,7 +175,7 @@ def dots(
     limit: float | None = None,
     limit_text: str = "",
 ) -> DotPlot:
-    """A dot plot with one mark for each name and series. A limit far above all values is stated, not drawn."""
+    """Return a dot plot with one mark for each name and series. A limit far above all values is stated, not drawn."""
     height = 300.0
     inner = height - _TOP - _BOTTOM
     known = [v for _, values in series for v in values if v is not None]
@@ -214,7 +214,7 @@ def _pixel_ticks(image_px: tuple[int, int], inner: float) -> tuple[tuple[Tick, .
 
 
 def _nice(value: float) -> float:
-    """The largest of 1, 2, 5 × 10ⁿ that is not above a value."""
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a value."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -57,7 +57,7 @@ TEMPLATES = Environment(
 
 
 def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
-    """How many events from `start` on keep files for the same step."""
+    """Return how many events from `start` on keep files for the same step."""
     first = rows[start]
     return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
 
@@ -76,7 +76,7 @@ TEMPLATES.filters["local_time"] = local_time
 
 
 def part_names(*names: str) -> Any:
-    """Path parameter that names one or more of a page's parts, between commas."""
+    """Return the path parameter that names one or more of a page's parts, between commas."""
     one = f"({'|'.join(names)})"
     return Path(pattern=f"^{one}(,{one}){{0,{len(names) - 1}}}$")
 
@@ -148,7 +148,7 @@ class PageProblem:
 
 
 def status_of(error: OrthocaptureError) -> int:
-    """The HTTP status that an error means."""
+    """Return the HTTP status that an error means."""
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 409)
 
 
@@ -167,7 +167,7 @@ def wants_json(request: Request) -> bool:
 
 
 def respond(request: Request, problem: PageProblem, headers: dict[str, str] | None = None) -> Response:
-    """A problem as page or as JSON."""
+    """Return a problem as page or as JSON."""
     if wants_json(request):
         return JSONResponse(asdict(problem), status_code=problem.status, headers=headers)
     _recognise(request)

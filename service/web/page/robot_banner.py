@@ -75,7 +75,7 @@ def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, drive
 
 
 def _joined(*sentences: str) -> str:
-    """Sentences one after the other, without those that are ""."""
+    """Return sentences one after the other, without those that are ""."""
     return " ".join(filter(None, sentences))
 
 

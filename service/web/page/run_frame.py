@@ -74,7 +74,7 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:
 
 
 def figure_line(verdict: GateVerdict) -> str:
-    """One figure of what is signed or did not pass."""
+    """Return one figure of what is signed or did not pass."""
     allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)
     undecided = "; not decided" if verdict.undecided else ""
     return f"{measure_name(verdict.measure)} {figure(verdict)} ({allowed}{undecided})"
@@ -126,7 +126,7 @@ def gate_word(verdict: GateVerdict, *, accepted: bool = False) -> tuple[str, str
 
 
 def phase_words(state: RunState, step: StepState, *, stopped: bool = False) -> tuple[str, str, str]:
-    """A step's status in the list of steps: word, tone, icon. `stopped`: the current one needs a decision."""
+    """Return a step's status in the list of steps: word, tone, icon. `stopped`: the current one needs a decision."""
     if step.skipped:
         return "skipped", "skipped", "skip"
     if step.phase == "passed" and step.accepted is not None:
@@ -201,7 +201,7 @@ def run_standing(
 
 
 def _driven(protocol: Protocol, state: RunState, decision: Decision, title: str) -> RunStanding:
-    """How a run stands that a process drives, whose robot is not stopped."""
+    """Return how a run stands that a process drives, whose robot is not stopped."""
     if state.paused:
         told = "The run is paused."
         return RunStanding("paused", decision, "waits", "Paused", "attention", "", told, f"Paused at: {title}.")
@@ -263,7 +263,7 @@ class RunFrame:
 
 
 def run_frame(site: Site, run_id: str) -> RunFrame:
-    """The frame of a run's pages. Raises UnknownRunError."""
+    """Return the frame of a run's pages. Raises UnknownRunError."""
     log = site.run(run_id)
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the run was read
@@ -300,12 +300,12 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
 
 
 def coats_of(site: Site, log: RunRecord) -> tuple[Coat, ...]:
-    """The coats of a run whose clocks run now."""
+    """Return the coats of a run whose clocks run now."""
     return coats(log.protocol, log.state, moment_of(site.store.clock))
 
 
 def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:
-    """The frames of all runs that a living process drives now, for the banners of pages that are not theirs.
+    """Return the frames of all runs that a living process drives now, for the banners of pages that are not theirs.
 
     Never raises: a run whose state cannot be read is shown as unknown.
 

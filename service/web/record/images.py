@@ -57,7 +57,7 @@ def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
 
 
 def step_to_show(log: RunRecord, steps: Sequence[Step], wanted: str) -> Step | None:
-    """The step asked for; else the current one, the last one with images, or the first; None without any."""
+    """Return the step asked for; else the current one, the last one with images, or the first; None without any."""
     by_id = {step.id: step for step in steps}
     if wanted in by_id:
         return by_id[wanted]
@@ -102,7 +102,7 @@ class FurtherCapture:
 
 
 def further_of(log: RunRecord, capture: Capture) -> list[FurtherCapture]:
-    """The images of further cameras at the viewpoint of a capture."""
+    """Return the images of further cameras at the viewpoint of a capture."""
     if not isinstance(capture.payload, ViewpointCaptured) or not capture.payload.further:
         return []
     live = live_jobs(log.state.steps[capture.payload.step])
@@ -110,7 +110,7 @@ def further_of(log: RunRecord, capture: Capture) -> list[FurtherCapture]:
 
 
 def further_cameras_of(log: RunRecord) -> tuple[KnownFurtherCamera, ...]:
-    """The further cameras of a run, by its valid images."""
+    """Return the further cameras of a run, by its valid images."""
     from service.dataset.further_cameras import known_further_cameras  # noqa: PLC0415 - numpy, not needed to start
 
     seqs = sorted(seq for step in log.state.steps.values() for seq in step.captured.values())
@@ -119,7 +119,7 @@ def further_cameras_of(log: RunRecord) -> tuple[KnownFurtherCamera, ...]:
 
 
 def captures_of(log: RunRecord, step: str) -> list[Capture]:
-    """Every exposure of a step in order, including replaced ones."""
+    """Return every exposure of a step in order, including replaced ones."""
     replaced = replaced_events(log)
     live = live_jobs(log.state.steps[step])
     out: list[Capture] = []
@@ -132,13 +132,13 @@ def captures_of(log: RunRecord, step: str) -> list[Capture]:
 
 
 def valid_capture(log: RunRecord, step: str, viewpoint: str) -> Capture | None:
-    """The exposure of a viewpoint that counts now."""
+    """Return the exposure of a viewpoint that counts now."""
     seq = log.state.steps[step].captured.get(viewpoint)
     return None if seq is None else capture_at(log, seq)
 
 
 def capture_at(log: RunRecord, seq: int) -> Capture | None:
-    """The exposure that an event records; None where the event is of another kind."""
+    """Return the exposure that an event records; None where the event is of another kind."""
     if not 1 <= seq <= len(log.events):
         return None
     event = log.events[seq - 1]
@@ -151,7 +151,7 @@ def capture_at(log: RunRecord, seq: int) -> Capture | None:
 def find_capture(
     log: RunRecord, viewpoint: str, *, step: str = "", attempt: int | None = None, seq: int | None = None
 ) -> Capture | None:
-    """The exposure of a viewpoint: that of an event, the last of an attempt, or the valid one.
+    """Return the exposure of a viewpoint: that of an event, the last of an attempt, or the valid one.
 
     Without a step the last step that has it.
     """
@@ -173,7 +173,7 @@ def find_capture(
 
 
 def live_jobs(state: StepState) -> Mapping[str, JobState]:
-    """The newest job that looked at each photograph of any camera, by SHA-256, finished or not."""
+    """Return the newest job that looked at each photograph of any camera, by SHA-256, finished or not."""
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
         if job.kind in (live_view.KIND.name, further_view.KIND.name):
@@ -187,7 +187,7 @@ def replaced_events(log: RunRecord) -> Mapping[int, Superseded]:
 
 
 def last_failures(log: RunRecord, step: str) -> Mapping[str, str]:
-    """The message of each viewpoint's last failure in the current attempt."""
+    """Return the message of each viewpoint's last failure in the current attempt."""
     attempt = log.state.steps[step].attempt
     return {
         event.payload.viewpoint: event.payload.message
@@ -268,7 +268,7 @@ def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
 
 
 def _reasons(state: StepState, answer: calibrate.Answer | None) -> dict[str, str]:
-    """Reasons against using an image, by viewpoint."""
+    """Return reasons against using an image, by viewpoint."""
     why: dict[str, str] = {}
     if answer is not None:
         details, hand_eye = answer.details, answer.hand_eye
@@ -293,7 +293,7 @@ def recorded_rig_section(log: RunRecord) -> RigSection:
 
 
 def rig_cameras(log: RunRecord) -> tuple[str, ...]:
-    """The names of its further cameras, in their order; they exist before any of them has taken an image."""
+    """Return the names of its further cameras, in their order; they exist before any of them has taken an image."""
     return tuple(recorded_rig_section(log).cameras)
 
 

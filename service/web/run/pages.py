@@ -58,7 +58,7 @@ class PageNote:
 
 
 def notes_of(events: Iterable[Event], step: str = "") -> tuple[PageNote, ...]:
-    """The notes of a run, or of one of its steps, in order."""
+    """Return the notes of a run, or of one of its steps, in order."""
     return tuple(
         PageNote(event.seq, event.at_utc, event.actor, note.step, note.text, note.photograph)
         for event in events
@@ -215,7 +215,7 @@ class RunPage:
 def run(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "", dialog: Name = ""
 ) -> HTMLResponse:
-    """The current step, or another one to look at."""
+    """Show the current step, or another one to look at."""
     shown = _shown(site, person, run_id, step, dialog)
     return render(request, "run/run.html.j2", shown, frame=run_frame(site, run_id))
 
@@ -224,7 +224,7 @@ def run(
 def run_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
-    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
+    """Show parts of the page, all from the same moment, for the script that keeps the page up to date."""
     asked = names.split(",")
     frame = run_frame(site, run_id) if "banner" in asked else None
     shown = None if asked == ["banner"] else _shown(site, person, run_id, step)
@@ -316,7 +316,7 @@ def _viewer(site: Site, person: Person, log: RunRecord) -> Viewer:
 
 
 def _taken_from(log: RunRecord, account: str) -> tuple[Event, ControlTaken] | None:
-    """The last change of control, if somebody else took it from this person."""
+    """Return the last change of control, if somebody else took it from this person."""
     changes = ((event, taken) for event in reversed(log.events) if isinstance(taken := event.payload, ControlTaken))
     last = next(changes, None)
     if last is None or last[0].actor == account:

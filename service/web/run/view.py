@@ -128,7 +128,7 @@ _DECIDED = frozenset({"confirm", "sign", "redo", "skip", "accept", "resume"})
 
 
 def _judged(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Iterator[JudgedStep]:
-    """The steps whose verdicts came since a person last decided something: nobody may have seen them yet."""
+    """Yield the steps whose verdicts came since a person last decided something: nobody may have seen them yet."""
     acts = (event for event in reversed(events) if isinstance(event.payload, ItemTicked | OperatorAction))
     decided = (event.seq for event in acts if not isinstance(act := event.payload, OperatorAction) or _decides(act))
     since = next(decided, 0)
@@ -171,7 +171,7 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
 
 
 def _paused_words(state: RunState, snapshot: Snapshot) -> str:
-    """How it stands with a paused run and its robot; what is not known to stand still is not said to."""
+    """Return how it stands with a paused run and its robot; what is not known to stand still is not said to."""
     if snapshot.doing != "paused" or snapshot.robot == "moving":
         return "Pausing… the robot may still move."
     if lost_arms(state):
@@ -296,12 +296,12 @@ def _more(state: RunState) -> StepMore | None:
 
 
 def _tab(protocol: Protocol, state: RunState, shown: str, mode: str) -> str:
-    """The title of the page in the browser's tab."""
+    """Return the title of the page in the browser's tab."""
     return f"Run {state.status}" if mode == "ended" and shown == state.current else protocol.step(shown).title
 
 
 def _photographs(events: Sequence[Event]) -> int:
-    """The photographs in the record: views, those that were replaced too, and others that a camera gave."""
+    """Return the photographs in the record: views, those that were replaced too, and others that a camera gave."""
     views = sum(isinstance(event.payload, RecordedView) for event in events)
     kept = (event.payload for event in events if isinstance(event.payload, FilesKept))
     return views + sum(ref.kind == "layout_image" for files in kept for ref in files.artefacts)
@@ -336,7 +336,7 @@ _BUTTONS: Mapping[OperatorVerb, str] = {
 
 
 def _ways(decision: object, mode: str) -> tuple[Choice, ...]:
-    """The choices; without what the large button does, where that is the normal course and stands above."""
+    """Return the choices; without what the large button does, where that is the normal course and stands above."""
     if not isinstance(decision, AskOperator):
         return ()
     return tuple(_way(way) for way in decision.ways if mode != "more" or way.verb != "confirm")

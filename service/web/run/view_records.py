@@ -65,7 +65,7 @@ class Reading:
 
 
 def gate_lines(step: Step, now: StepState, skipped: frozenset[str]) -> tuple[GateLine, ...]:
-    """Every gate of a step with what is known of it."""
+    """Return every gate of a step with what is known of it."""
     known = {verdict.measure: verdict for verdict in now.verdicts}
     accepted = now.accepted is not None
     return tuple(_gate_line(gate, known.get(gate.measure), skipped, accepted=accepted) for gate in step.gates)

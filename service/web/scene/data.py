@@ -74,7 +74,7 @@ class MeshFacts:
 
 
 def scene_of(log: RunRecord) -> KnownScene:
-    """The best known scene: registered, else provisional, else planned."""
+    """Return the best known scene: registered, else provisional, else planned."""
     registered = displayed_registration(log)
     if registered is not None:
         return _registered(log, registered)
@@ -182,7 +182,7 @@ def _live(log: RunRecord) -> KnownScene | None:
 
 
 def _live_further(log: RunRecord) -> dict[str, dict[str, Transform]]:
-    """T_ct_camera of further cameras, each by its image alone; of one that stands still, the newest."""
+    """Return T_ct_camera of further cameras, each by its image alone; of one that stands still, the newest."""
     found: dict[str, dict[str, Transform]] = {}
     for step in log.protocol.steps:
         for capture in captures_of(log, step.id):
@@ -198,7 +198,7 @@ def _live_further(log: RunRecord) -> dict[str, dict[str, Transform]]:
 
 
 def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
-    """Viewpoints of the current step that are still to be taken: name, station, T_base_camera."""
+    """Return viewpoints of the current step that are still to be taken: name, station, T_base_camera."""
     state = log.state.step
     if log.state.terminal:
         return []
@@ -211,7 +211,7 @@ def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
 
 
 def _planned(log: RunRecord) -> KnownScene:
-    """One station in its base frame: past camera poses by the mount's design, and planned ones."""
+    """Return one station in its base frame: past camera poses by the mount's design, and planned ones."""
     captured = _all_captures(log)
     to_come = _to_come(log)
     station = to_come[0][1] if to_come else captured[-1].station if captured else ""
@@ -241,7 +241,7 @@ def _planned(log: RunRecord) -> KnownScene:
 
 
 def _table(centre_m: tuple[float, float, float]) -> SceneMesh:
-    """A square of 0.4 m where the scene is expected."""
+    """Return a square of 0.4 m where the scene is expected."""
     offsets = 0.2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     return SceneMesh(np.array(centre_m) + offsets, np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -264,13 +264,13 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
 
 
 def predicted_error_mm(registered: DisplayedRegistration, points_m: Array) -> Array:
-    """3D standard deviation (N,) of points (N, 3) of the scan, due to the registration with the images, mm."""
+    """Return 3D standard deviation (N,) of points (N, 3) of the scan, due to the registration with the images, mm."""
     placed = Alignment(np.array(registered.record.T_world_scan), np.array(registered.record.covariance)[:6, :6])
     return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)
 
 
 def mesh_facts(now: KnownScene, log: RunRecord, data: Path) -> MeshFacts | None:
-    """Facts about the surface; None without a surface."""
+    """Return facts about the surface; None without a surface."""
     return None if now.mesh is None else _surface(log, now.mesh, data)[2]
 
 
@@ -355,7 +355,7 @@ class SceneTables:
 
 
 def scene_tables(log: RunRecord, data: Path) -> SceneTables:
-    """The tables; positions are in the frame that the record uses, not in that of the picture."""
+    """Return the tables; positions are in the frame that the record uses, not in that of the picture."""
     now = scene_of(log)
     T_view = viewing_frame(now.scene)
     down, centre = -T_view[2, :3], -T_view[:3, :3].T @ T_view[:3, 3]
