@@ -54,7 +54,7 @@ class ChildProcesses:
     """Runs one module in child processes, at most one at a time for each run."""
 
     def __init__(self, module: str, name: str, clock: Clock) -> None:
-        """Args: `name`: what the module makes, for messages, such as "export"."""
+        """Run `module`; `name` says in messages what it makes, such as "export"."""
         self._module = module
         self._name = name
         self._clock = clock
@@ -286,7 +286,7 @@ class IncrementalResults(Generic[T]):
         return self.at(run_id, last, sha256)
 
     def at(self, run_id: str, last: int, sha256: str) -> T | PartialProgress:
-        """`ready` for a known end of the chain."""
+        """Do as `ready` for a known end of the chain."""
         entry = self._entry(run_id)
         step = entry.step
         if step is None:

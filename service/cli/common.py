@@ -227,7 +227,7 @@ def _unwritable(path: Path, error: OSError) -> ConfigurationError:
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr, shown after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
+    """Show a progress bar on stderr after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
     started = time.monotonic()
     bar = bar_of_shares(error_console)
     task = bar.add_task("", total=None)

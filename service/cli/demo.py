@@ -142,7 +142,7 @@ def _evaluated(
 
 
 def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
-    """True registration error in mm at the scene's centre for each source of poses, from the simulator's own record.
+    """Return the true registration error, mm, at the scene's centre by source of poses, from the simulator's record.
 
     Only the demo and tests use it, after the run.
     """
@@ -156,7 +156,7 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
 
 
 def true_cameras(summary: RunSummary, exposures_log: Path) -> dict[str, Array]:
-    """The true T_world_camera (4, 4) of each capture's first file, by viewpoint, from the simulated camera's log."""
+    """Return the true T_world_camera (4, 4) of each capture's first file, by viewpoint, from the camera's log."""
     exposures = [json_module.loads(line) for line in exposures_log.read_text().splitlines() if line.strip()]
     by_sha256 = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
     return {
@@ -187,7 +187,7 @@ def true_error_mm(
 
 
 def free_address() -> str:
-    """The first loopback address at which a simulated arm's ports are free; clients of the arm use fixed ports.
+    """Return the first loopback address where a simulated arm's ports are free; the arm's clients use fixed ports.
 
     Raises:
         ConfigurationError: they are free at no address.

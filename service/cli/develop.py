@@ -46,7 +46,7 @@ def develop_command(
 
 
 def _require_new(files: list[Path], out: Path) -> None:
-    """Nothing is overwritten, and every raw file has a name of its own."""
+    """Require that nothing is overwritten, and that every raw file has a name of its own."""
     require_writable_folder(out)
     stems = [file.stem for file in files]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)

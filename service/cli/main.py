@@ -256,7 +256,7 @@ def orthocapture(
 
 
 def main() -> None:
-    """Entry point of the distribution."""
+    """Run the command line; the entry point of the distribution."""
     begin_loading()  # until the command is loaded
     # With small matrices and many processes, threads of the linear algebra wait for each other and are ten times
     # slower on a busy machine. The library reads this when it is loaded, here and in every child process.

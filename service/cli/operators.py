@@ -184,7 +184,7 @@ class ScreenOperator(_Operator):
     """People at screens, whose answers arrive as events; this process only watches the pedal."""
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
-        """Always None: the web process records what people do."""
+        """Return None always: the web process records what people do."""
         return None
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
@@ -343,7 +343,7 @@ class TerminalOperator(_Operator):
 
 
 def _elsewhere(protocol: Protocol, state: RunState, asked: AskOperator) -> tuple[Asks, str]:
-    """A question in a few words, for people who are elsewhere; what a step asks for in its course is no trouble."""
+    """Return a question in a few words for people elsewhere; what a step asks for in its course is no trouble."""
     title, wanted = protocol.step(asked.step).title, state.step.in_course
     if wanted is not None:
         return "confirm", f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}"

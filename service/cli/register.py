@@ -190,7 +190,7 @@ def register_command(
 
 
 def _gates(result: PipelineResult) -> list[Gate]:
-    """The limits of a registration: those of the shipped protocols' evaluation, and that nothing contradicts."""
+    """Return the limits of a registration: those of the shipped protocols' evaluation, and of contradictions."""
     gates = [
         Gate(measure="contradictions", max=0, unit="", why="inputs that contradict one another give no registration"),
         Gate(measure="predicted_error_mm", max=_MOST_MM, unit="mm", why="the paper's figure"),
@@ -242,7 +242,7 @@ def _file_detector(
 
 
 def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:
-    """Counts of images searched whole and at predicted places only, and the spheres missing there, as plain data."""
+    """Return counts of images searched whole or at predicted places only, and of missing spheres, as plain data."""
     return {
         "images_searched": located.count("searched"),
         "images_predicted": located.count("predicted"),

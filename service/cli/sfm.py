@@ -199,7 +199,7 @@ def _reconstruct(
 def _disagreement(
     solved: SfmModel, prior: Mapping[str, Transform], stations: Mapping[str, str] | None
 ) -> tuple[float, float]:
-    """Rms distance between the robot's and the reconstructed camera positions, and the cameras' spread, in metres."""
+    """Return the rms distance of the robot's from the reconstructed camera positions, and the cameras' spread, m."""
     squares: list[float] = []
     spread: list[float] = []
     groups = sorted({stations[name] for name in solved.T_world_camera}) if stations else [""]

@@ -27,7 +27,7 @@ _SPLITS = TypeAdapter(Splits)
 
 
 def data_set_of_folder(folder: Path) -> DataSet:
-    """The data set that `orthocapture export --format hdf5` wrote; its identity is the SHA-256 of its `SHA256SUMS`.
+    """Return the data set that `orthocapture export --format hdf5` wrote; its identity is its `SHA256SUMS`' SHA-256.
 
     Raises:
         DataError: the folder is in another format, a file of it was changed or is missing, or it cannot be read.
@@ -55,23 +55,23 @@ class StoredPixels:
         return png(self.colours(view), self._mark)
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR."""
+        """Return the colours (H, W, 3), BGR."""
         return np.ascontiguousarray(self._array(view, "image")[..., ::-1], dtype=np.uint8)
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh."""
+        """Return the depth (H, W), z of the mesh."""
         return self._array(view, "depth_m").astype(np.float32)
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) normals of the mesh."""
+        """Return the normals (H, W, 3) of the mesh."""
         return self._array(view, "normal").astype(np.float32)
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """Pixels that the photograph has."""
+        """Return which pixels the photograph has, (H, W)."""
         return self._array(view, "valid").astype(np.bool_)
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Spheres and posts."""
+        """Return which pixels show a sphere or a post, (H, W)."""
         return self._array(view, "markers").astype(np.bool_)
 
     def _array(self, view: PosedView, name: str) -> NDArray[Any]:

@@ -86,13 +86,13 @@ def write_data_set(
 
 
 def _write(dataset: DataSet, how: Exporter, folder: ExportFolder) -> None:
-    """The files of the format, and those that every folder has."""
+    """Write the files of the format, and those that every folder has."""
     how.write(dataset, folder)
     write_package(dataset, folder, form=how.name, words=how.words, description=how.write.__doc__ or "")
 
 
 def _told(dataset: DataSet, how: Exporter, progress: Progress | None) -> Callable[[int], None]:
-    """Turns a number of files into progress."""
+    """Return a function that turns a number of files into progress."""
     if progress is None:
         return lambda _count: None
     total = count_files(lambda folder: _write(dataset, how, folder))

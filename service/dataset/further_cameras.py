@@ -71,7 +71,7 @@ def pose_sigmas(located: Answer) -> tuple[float, float]:
 
 
 def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | None:
-    """T_scan_camera (4, 4) of a further camera while the first one was at this pose; None where it is not known."""
+    """Return T_scan_camera (4, 4) of a further camera while the first one was at this pose; None if not known."""
     if located.T_outer_camera is None or (located.mounted == "rigid" and T_scan_first is None):
         return None
     T_outer_camera = np.array(located.T_outer_camera)

@@ -43,7 +43,7 @@ class _Ground:
 
 
 def posts_of(summary: RunSummary, spheres: Sequence[WorldSphere], views: Sequence[PosedView]) -> Posts:
-    """The posts below spheres, along the normal of the board that the scan shows, or the z axis of an arm's base.
+    """Return the posts below spheres, along the normal of the board in the scan, or the z axis of an arm's base.
 
     They end on the board or, if the scan shows none, on the table that the rig file states, on which the board lies.
     """
@@ -111,7 +111,7 @@ def _rig(summary: RunSummary) -> RigSection | None:
 
 
 def upwards(mesh: Mesh, about: Array) -> Array:
-    """Unit normal (3,) of the board: the direction, within 45° of `about`, to which most of the surface is level.
+    """Return the board's unit normal (3,): the direction within 45° of `about` to which most surface is level.
 
     Zero where no direction has a twentieth of the surface: the mesh shows no board.
     """

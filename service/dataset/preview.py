@@ -166,7 +166,7 @@ def small_camera(camera: CameraModel) -> CameraModel:
 
 
 def depth_colours(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> Colours:
-    """(H, W, 4) blue, green, red and opacity: near is yellow, far is violet, no surface is transparent."""
+    """Colour a depth, (H, W, 4) blue, green, red, opacity: near is yellow, far violet, no surface transparent."""
     level = np.clip((far_m - depth_m) / max(far_m - near_m, 1e-9) * 255, 0, 255).astype(np.uint8)
     colours = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
     return np.dstack([colours, np.where(depth_m > 0, 255, 0).astype(np.uint8)])

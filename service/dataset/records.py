@@ -226,23 +226,23 @@ class Pixels(Interface):
         ...
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR of the picture. Raises DataError if it cannot be read."""
+        """Return the colours (H, W, 3) of the picture, BGR. Raises DataError if it cannot be read."""
         ...
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh in the camera frame, m; 0 where none is seen."""
+        """Return the depth (H, W), z of the mesh in the camera frame, m; 0 where none is seen."""
         ...
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) unit normals of the mesh in the camera frame, towards the camera; 0 where none is seen."""
+        """Return unit normals (H, W, 3) of the mesh in the camera frame, towards the camera; 0 where none is seen."""
         ...
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """(H, W) pixels that the picture has; others are outside the photograph that was resampled."""
+        """Return which pixels (H, W) the picture has; others are outside the photograph that was resampled."""
         ...
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """(H, W) pixels that a sphere or post covers."""
+        """Return which pixels (H, W) a sphere or post covers."""
         ...
 
 

@@ -72,7 +72,7 @@ def further_cameras(protocol: Protocol, state: RunState) -> dict[str, further_ca
 
 
 def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
-    """All rows of the paper's table; `late` says when a late row arrived, and is "" for a row of the evaluation."""
+    """Return all rows of the paper's table; `late` says when a late row arrived, "" for a row of the evaluation."""
     rows = [row.model_copy(update={"late": ""}) for row in signed_rows(protocol, state)]
     known = {row.poses for row in rows}
     for _, job in later_evaluations(protocol, state) if rows else ():
@@ -84,12 +84,12 @@ def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
 
 
 def arrived(protocol: Protocol, state: RunState, job: JobState) -> str:
-    """`arrived 12 min after the specimen was freed`, or `arrived after the evaluation` if it was not freed yet."""
+    """Say `arrived 12 min after the specimen was freed`, or `arrived after the evaluation` if that came first."""
     return "arrived after the evaluation" if job.late_s is None else late_words(protocol, state, job.late_s)
 
 
 def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
-    """A note that some rows share one adjustment, so their agreement confirms nothing; "" without two such rows.
+    """Return a note that some rows share one adjustment, so that their agreement confirms nothing; "" without two.
 
     Incremental mapping, global mapping and triangulation each give initial poses from part of the tracks; the final
     model is one bundle adjustment of all tracks from there (service/compute/sfm/child.py).
@@ -155,7 +155,7 @@ def best_registration(protocol: Protocol, state: RunState) -> str | None:
 
 
 def best_row(rows: Sequence[Row]) -> Row:
-    """The row of an evaluation's table with the smallest error on the control spheres; of equal ones the first."""
+    """Return the row of an evaluation's table with the smallest error on control spheres; of equal ones the first."""
     return min(rows, key=_error_mm)
 
 

@@ -103,7 +103,7 @@ def data_set_of(
 
 
 def specimen_pixels(summary: RunSummary, view: PosedView) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """(H, W) pixels between the spheres, which stand around the specimen."""
+    """Return which pixels (H, W) lie between the spheres, which stand around the specimen."""
     return hull_mask(view.camera, view.T_world_camera, np.array(summary.scan_spheres_m()))
 
 

@@ -152,7 +152,7 @@ class RunSummary:
             return mesh["vertices_m"], mesh["faces"]
 
     def ground_truth(self) -> GroundTruth:
-        """The mesh of the data set, in the scan's frame: CT and scan fused if the run has that, else the scan."""
+        """Return the data set's mesh, in the scan's frame: CT and scan fused if the run has that, else the scan."""
         fused = self.artefacts("ground_truth_mesh")
         if not fused:
             vertices_m, faces = self.scan_mesh()

@@ -21,7 +21,7 @@ from service.jobs.register import Registration
 
 
 def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:
-    """(6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, without the errors that are common to all.
+    """Return the joint covariance (6 N, 6 N) of T_scan_camera of these viewpoints, without errors common to all.
 
     Stated for poses of structure from motion: the covariance of their bundle adjustment, after a similarity has
     aligned the positions with the true ones, in the scan's axes and in metres. The error of the scale is not in it,

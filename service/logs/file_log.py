@@ -225,7 +225,7 @@ _PATTERNS = (
 
 
 def without_secrets(value: Any, name: str = "") -> Any:
-    """A copy of plain data with secrets replaced by `[secret]`, found by field name and by pattern within text."""
+    """Return a copy of plain data with secrets replaced by `[secret]`, found by field name and by pattern in text."""
     if name and _NAME.fullmatch(name) and value not in (None, "", False, True):
         return OUT
     if isinstance(value, str):

@@ -263,7 +263,7 @@ _INTERRUPTS = ("operator_action", "leave_lapsed")
 
 
 def read_step_times(store: Store, run_id: str) -> EarlierTimes:
-    """Seconds from the beginning of each step's work to its figures, in the earlier runs of the run's protocol.
+    """Return the seconds from the start of each step's work to its figures, in earlier runs of the run's protocol.
 
     Runs of a simulated rig say nothing of a real one, nor the other way round. Raises StoreError.
     """

@@ -87,7 +87,7 @@ def read_robot(devices: OpenDevices) -> RobotReading:
 
 
 def watch_robot(devices: OpenDevices, now_s: float) -> RobotReading:
-    """The open robots' gravest state by their pose streams up to `now_s` (monotonic), which satisfies no watchdog."""
+    """Return the open robots' gravest state by their pose streams up to `now_s` (monotonic). No watchdog is fed."""
     return _gravest(_watched(name, robot, now_s) for name, robot in devices.robots.items())
 
 

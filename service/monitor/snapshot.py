@@ -159,7 +159,7 @@ def ask_for_frames(data: Path, run_id: str, camera: str = "") -> None:
 
 
 def frames_wanted(data: Path, run_id: str, now_utc_s: float, *, within_s: float = 3.0) -> str | None:
-    """The camera at whose live view somebody has looked within this time, last; "": the first one; None: nobody."""
+    """Return the camera whose live view was last looked at within this time; "": the first one; None: none was."""
     path = _path(data, run_id, "wanted")
     try:
         age = age_s(path.stat().st_mtime, now_utc_s, if_set_back_s=math.inf)

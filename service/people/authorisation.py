@@ -68,7 +68,7 @@ def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identit
 
 
 def who_pauses(people: People, typed: str) -> Identity:
-    """Whoever pauses a run, without a password and whatever the name: pausing is always safe.
+    """Identify whoever pauses a run, without a password and whatever the name: pausing is always safe.
 
     Where there are accounts, the record says that the name was only claimed.
     """

@@ -68,7 +68,7 @@ class People:
         self.badges = Badges(store, self._short, self.check_password)
 
     def first_link(self) -> str | None:
-        """A new one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
+        """Make a one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
         return self.accounts.first_link()
 
     # --- passwords ---

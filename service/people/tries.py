@@ -161,7 +161,7 @@ def failed_tries(store: Store, window_s: float) -> list[tuple[str, float]]:
 
 
 def _recent(store: Store, window_s: float) -> Iterator[tuple[Row[Any], SignInRecorded, float]]:
-    """Row, payload and age of what was recorded of sign-ins within the last `window_s` seconds, newest first."""
+    """Yield row, payload and age of recorded sign-ins within the last `window_s` seconds, newest first."""
     since = _first_start(store)
     newest_first = _OF_SITE.where(event_index.c.kind == "sign_in_recorded").order_by(event_index.c.seq.desc())
     with store.database.reading() as connection:

@@ -205,7 +205,7 @@ def _refused(error: OSError) -> StoreError:
 
 
 def _candidates(folder: Path) -> list[tuple[Path, float, int]]:
-    """(path, time of last change in s UTC, size in bytes) of files that look like leftovers, sorted by path."""
+    """Return (path, time of last change in s UTC, size in bytes) of possible leftovers, sorted by path."""
     found: list[tuple[Path, float, int]] = []
     for path in sorted(folder.glob("*/*")):
         if path.is_symlink() or not path.is_file():

@@ -66,7 +66,7 @@ def read_runs(connection: Connection) -> list[RunRow]:
 
 
 def read_open_runs(connection: Connection) -> set[str]:
-    """Runs that have neither an end recorded by the runner nor an operator's abort, which it confirms later."""
+    """Return runs with neither an end recorded by the runner nor an operator's abort, which it confirms later."""
     ended = (
         select(event_index.c.seq)
         .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
@@ -271,7 +271,7 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
 
 
 def _watch(database: Database, clock: Clock, run_id: str, seconds: float) -> tuple[str, float] | None:
-    """The lease of another host that has run out by UTC, once the time in which it would be renewed has passed."""
+    """Return another host's lease that has run out by UTC, once the time in which it would be renewed has passed."""
     with database.reading() as connection:
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
     if row is None or identity_of(row).life() != "unknown" or clock.utc_s() < row.until_utc_s:

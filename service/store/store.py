@@ -218,7 +218,7 @@ class Store:
         actor: str,
         software: Mapping[str, str] | None = None,
     ) -> list[Event]:
-        """`record_site` within a transaction of `database.writing()`, so that an action and its record are atomic."""
+        """Do as `record_site` in a transaction of `database.writing()`, so that action and record are atomic."""
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
             opened = SiteOpened(software=dict(software or {}))
             begin_chain(connection, self._clock, self._folder, SITE, opened, actor, ())
@@ -315,7 +315,7 @@ class Store:
             return connection.execute(found).first() is not None
 
     def checkpoints(self, run_id: str) -> list[Checkpoint]:
-        """All checkpoints of a run's chain, or of the site's (SITE), oldest first; signatures.signing makes them."""
+        """Return all checkpoints of a run's or the site's (SITE) chain, oldest first (made by signatures.signing)."""
         with self._database.reading() as connection:
             return read_checkpoints(connection, run_id)
 

@@ -51,7 +51,7 @@ class Connection:
         return 2 * self.known + (self.answering > 0)
 
     def stop_waiting(self) -> None:
-        """The request has arrived, or the connection is gone."""
+        """Stop the wait: the request has arrived, or the connection is gone."""
         if self.timer is not None:
             self.timer.cancel()
             self.timer = None
@@ -74,7 +74,7 @@ class Connections:
     """
 
     def __init__(self, limits: ConnectionLimits, *, without_limit: Container[str] = ()) -> None:
-        """`without_limit`: addresses that stand for many clients; only the limit in all counts for them."""
+        """Hold none yet; `without_limit`: addresses of many clients, for which only the limit in all counts."""
         self.limits = limits
         self._without_limit = without_limit
         self._open: dict[Peer, Connection] = {}
@@ -98,7 +98,7 @@ class Connections:
         return self._open.get(peer)
 
     def leave(self, connection: Connection) -> None:
-        """Its socket is closed."""
+        """Forget a connection whose socket is closed."""
         connection.stop_waiting()
         if self._open.get(connection.peer) is connection:
             del self._open[connection.peer]

@@ -53,7 +53,7 @@ class RequestCounts:
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request and count it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -103,11 +103,11 @@ class DataFolderMetrics(Collector):
         self._health = health
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing, so that registering the collector does not read the database."""
+        """Return nothing, so that registering the collector does not read the database."""
         return ()
 
     def collect(self) -> Iterable[Metric]:
-        """Yield one scrape."""
+        """Yield the metrics of one scrape."""
         health = self._health()
         parts = {
             "database": health.database,

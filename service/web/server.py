@@ -42,7 +42,7 @@ class Reception:
         self._connections = connections
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request."""
         client: tuple[str, int] | None = scope.get("client")
         connection = self._connections.find((client[0], client[1])) if client else None
         if scope["type"] != "http" or connection is None:
@@ -87,12 +87,12 @@ class ForwardedClient:
     """The client's address and scheme as a proxy forwards them, believed from known proxies alone."""
 
     def __init__(self, app: ASGIApp, proxies: frozenset[str]) -> None:
-        """`proxies`: addresses as `plain_address` writes them."""
+        """Believe the `proxies` only, addresses as `plain_address` writes them."""
         self._app = app
         self._proxies = proxies
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request."""
         client: tuple[str, int] | None = scope.get("client")
         if scope["type"] == "http" and client:
             address, port = plain_address(client[0]), client[1]
@@ -214,7 +214,7 @@ def _kind(record: logging.LogRecord) -> Kind:
 
 @contextmanager
 def sparing_log(clock: Clock) -> Generator[SparingHandler]:
-    """All messages of this process go through one such handler to stderr, and through no other."""
+    """Send all messages of this process through one such handler to stderr, and through no other."""
     handler = SparingHandler(sys.stderr, clock)
     root = logging.getLogger()
     usual = root.handlers[:]
@@ -293,7 +293,7 @@ class Server(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Generator[None]:
-        """Ctrl-C and SIGTERM end the server."""
+        """Let Ctrl-C and SIGTERM end the server."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self.handle_exit)
         yield

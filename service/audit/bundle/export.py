@@ -210,7 +210,7 @@ def _zip_time(at_utc: str) -> ZipTime:
 
 
 def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[AuditReport, int], bytes]:
-    """Returns a function that makes the HTML report of a run up to an event from the result of its verification.
+    """Return a function that makes the HTML report of a run up to an event from the result of its verification.
 
     The report is dated by the last event in the bundle, so that the same evidence gives the same bytes.
     """

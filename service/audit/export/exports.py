@@ -220,7 +220,7 @@ class Exports:
         )
 
     def _path(self, record: EvidenceExported) -> Path | None:
-        """The file, or the folder of a data set, if it exists with the recorded size (of its list of checksums).
+        """Return the file, or a data set's folder, if it exists with the recorded size (of its list of checksums).
 
         Names that lead out of the folder are refused, and so are links.
         """

@@ -252,7 +252,7 @@ class Shots:
 
 
 def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, int]) -> list[Shots]:
-    """The photographs of each step that took any or tried to. `failures`: number of failed exposures by step."""
+    """Return the photographs of each step that took any or tried to; `failures`: failed exposures by step."""
     found: list[Shots] = []
     for step in protocol.steps:
         now = state.steps[step.id]
@@ -267,7 +267,7 @@ def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, in
 
 
 def shots_of(digest: Digest | None, failures: Mapping[str, int]) -> list[Shots]:
-    """`shots_by_step` of a digest; empty while there is none."""
+    """Return `shots_by_step` of a digest; empty while there is none."""
     if digest is None or digest.protocol is None or digest.state is None:
         return []
     return shots_by_step(digest.protocol, digest.state, failures)

@@ -83,7 +83,7 @@ class Finding:
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
-    """The deviations of a run, accepted gates first; with `group`, what is in this group, deviations or not."""
+    """Return a run's deviations, accepted gates first; with `group`, what is in this group, deviations or not."""
     kinds = GROUPS[group][1] if group in GROUPS else None
     listed = digest.automatic if group == "automatic" else digest.deviations
     found = [
@@ -98,7 +98,7 @@ def findings(digest: Digest, group: str = "") -> list[Finding]:
 
 
 def failed_gates(digest: Digest) -> list[Finding]:
-    """The gates that did not pass in some attempt, in order: no deviations, but what a reader asks for next."""
+    """Return the gates that did not pass in some attempt, in order: no deviations, but what readers ask for next."""
     return sorted(map(_of_gate, digest.failed_gates), key=lambda finding: finding.seq)
 
 

@@ -117,7 +117,7 @@ class EventRow:
     job: str = ""  # that it is about
 
     def record(self, kind: type[P]) -> P | None:
-        """The payload as a record of this kind; None if it is another kind, was altered, or is not complete here."""
+        """Return the payload as a record of this kind; None if it is of another kind, altered or incomplete."""
         try:
             return kind.model_validate(self.payload)
         except ValidationError:
@@ -185,7 +185,7 @@ _TELLING = (
 
 
 def headline(payload: Mapping[str, Any]) -> str:
-    """An event in one line: the most telling fields first, without field names if the value is clear without them."""
+    """Return an event in one line: the most telling fields first, without field names where the value is clear."""
     told = [str(payload[name]) for name in _TELLING if isinstance(payload.get(name), str) and payload[name]]
     if "passed" in payload:
         told.append("passed" if payload["passed"] else _not_passed(payload.get("verdicts")))

@@ -183,7 +183,7 @@ class Facets:
     devices: dict[str, int] = field(default_factory=dict[str, int])
 
     def matching(self, wanted: EventFilter) -> int | None:
-        """The number of events that match a filter with one condition; None for filters with none or several."""
+        """Return the number of events that match a filter with one condition; None with none or several."""
         counts = {"kind": self.kinds, "step": self.steps, "person": self.people}
         fields = wanted.query()
         if len(fields) != 1 or not counts.keys() & fields.keys():

@@ -80,7 +80,7 @@ class Comparison:
         return all(d.within_tolerance for d in self.differences)
 
     def of_recorded(self) -> Comparison:
-        """The comparison of the fields that were recorded, without those that only the recomputed data have."""
+        """Return the comparison of the recorded fields, without those that only the recomputed data have."""
         return replace(self, differences=tuple(d for d in self.differences if not d.added))
 
 

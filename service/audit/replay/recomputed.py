@@ -126,7 +126,7 @@ class RecomputedJobs:
         return self.renamed.get(value, value) if isinstance(value, str) else value
 
     def measures_of(self, step: StepState) -> dict[str, float] | None:
-        """A step's measures with the recomputed measures of its jobs; None if no job of it was computed again."""
+        """Return a step's measures with the recomputed ones of its jobs; None if no job of it was computed again."""
         pairs = {pair.before.job: pair for pair in self.pairs if pair.step == step.step}
         if not pairs:
             return None

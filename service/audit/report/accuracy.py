@@ -177,7 +177,7 @@ def _texts(row: Row, *, best: bool) -> tuple[str, ...]:
 
 
 def later_section(summary: RunSummary) -> Section | None:
-    """Results that arrived after the evaluation, what they changed, and what is still missing; None without any."""
+    """Return results that arrived after the evaluation, their effect, and what is still missing; None without any."""
     late = late_results(summary.protocol, summary.state)
     missing = not_in_yet(summary.protocol, summary.state, summary.events)
     if not late and not missing:

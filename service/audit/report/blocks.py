@@ -255,7 +255,7 @@ _JUDGED: dict[Standing, TableCell] = {
 
 
 def judged(verdict: GateVerdict, *, accepted: bool = False) -> TableCell:
-    """The verdict of a gate as a sign and a word with a tone. `accepted`: a person accepted the step's figures."""
+    """Return a gate's verdict as a sign and a word with a tone. `accepted`: a person accepted the step's figures."""
     return _JUDGED[standing(verdict, accepted=accepted)]
 
 

@@ -332,7 +332,7 @@ def _csv(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _plain(cell: str) -> str:
-    """The text, with an apostrophe in front if a spreadsheet would take it for a formula; numbers are unchanged."""
+    """Return the text, with an apostrophe in front if a spreadsheet would take it for a formula; numbers stay."""
     return f"'{cell}" if re.match(r"[=+@\t\r]|-(?![\d.])", cell) else cell
 
 

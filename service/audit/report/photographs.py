@@ -143,7 +143,7 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
 
 
 def _contact_sheets(run: RecordedRun, step: Step) -> tuple[list[Block], list[tuple[str, str, str, str]]]:
-    """The contact sheets of a step, one for each camera, and a row of `_ORIGINALS` for each of their pictures."""
+    """Return a step's contact sheets, one for each camera, and a row of `_ORIGINALS` for each picture of them."""
     blocks: list[Block] = []
     seqs = sorted(run.state.steps[step.id].captured.values())
     captures = [(seq, run.events[seq - 1].payload) for seq in seqs]

@@ -117,7 +117,7 @@ def _about(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty
 
 
 def _steps(first: ComparedRun, second: ComparedRun) -> list[tuple[str, str]]:
-    """Identifier and title of every step, in the order of the first run; steps of the second alone come last."""
+    """Return identifier and title of every step, as the first run orders them; steps of the second alone are last."""
     titles = {step.id: step.title for run in (second, first) for step in run.protocol.steps}
     return [(name, titles[name]) for name in dict.fromkeys([*first.protocol.step_ids, *second.protocol.step_ids])]
 

@@ -421,7 +421,7 @@ class FolderBundle(Bundle):
 
 
 def name_problem(name: str) -> str:
-    """Why a name must not be in a bundle (it could lead out of the folder it is unpacked to); "" for a good one."""
+    """Return why a name must not be in a bundle (it could lead out of the unpacked folder); "" for a good one."""
     if not name or "\\" in name or "\x00" in name or name.startswith("/") or re.match(r"[A-Za-z]:", name):
         return "the name leads out of the bundle, or is none"
     if any(part in ("", ".", "..") for part in name.rstrip("/").split("/")):
@@ -479,11 +479,11 @@ class Check:
         self.counts: dict[str, int] = {}
 
     def fault(self, where: str, what: str) -> None:
-        """Something that is not as it should be."""
+        """Note something that is not as it should be."""
         self.faults.append({"where": where, "what": what})
 
     def run(self, path: Path, key: str | None, certificates: Path | None) -> None:
-        """Everything. Raises NotABundleError."""
+        """Verify everything. Raises NotABundleError."""
         if not path.exists():
             raise NotABundleError(f"{path} is not there")
         bundle = FolderBundle(path, self.fault) if path.is_dir() else ZipBundle(path, self.fault)
@@ -916,7 +916,7 @@ class Chain:
 
 
 def _heads(value: Any) -> dict[str, tuple[int, str]]:
-    """Ends of chains as recorded when the service started; what is not one is left out, and the hash reveals it."""
+    """Return ends of chains as recorded at a start of the service, without malformed ones: the hash shows them."""
     found = value.items() if isinstance(value, dict) else ()
     pairs = {run: end for run, end in found if isinstance(end, list) and len(end) == 2}
     return {run: (end[0], end[1]) for run, end in pairs.items() if isinstance(end[0], int)}
@@ -1180,7 +1180,7 @@ def report(check: Check) -> str:
 
 
 def shown(text: str) -> str:
-    """One line, with every character escaped that a terminal would obey: an attacker may have chosen the names."""
+    """Return one line with every character escaped that a terminal would obey: an attacker may choose names."""
     return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -158,7 +158,7 @@ def _sigma(covariance: NDArray[np.float64]) -> float:
 
 
 def _graph(dataset: DataSet, covisible: Covisibility) -> dict[str, object]:
-    """Views as nodes with the points that they see, pairs as edges with the points of both, and connected parts."""
+    """Return the graph: views as nodes with their points, pairs as edges with common points, and connected parts."""
     names = [view.name for view in dataset.views]
     edges = covisible.pairs()
     return {

@@ -20,7 +20,7 @@ def ply(vertices: Array, faces: NDArray[np.int64], comment: str) -> bytes:
 
 
 def ground_truth_ply(mesh: Mesh, comment: str) -> bytes:
-    """A binary PLY of the ground truth in metres; if they are known, with `source` and `sigma_m` of each vertex."""
+    """Return a binary PLY of the ground truth in metres, with `source` and `sigma_m` of each vertex if known."""
     columns: dict[str, NDArray[np.generic]] = {
         name: mesh.vertices_m[:, k].astype("<f8") for k, name in enumerate("xyz")
     }

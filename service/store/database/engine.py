@@ -131,7 +131,7 @@ class Database:
                     self._commit(raw, transaction)
 
     def _watched(self, connection: Connection) -> sqlite3.Connection | None:
-        """The driver's connection, whose changes are noted; None without a journal, or before the tables are made."""
+        """Return the driver's connection, whose changes are noted; None without a journal or before tables exist."""
         raw = connection.connection.driver_connection
         assert isinstance(raw, sqlite3.Connection)  # the engine's own driver
         if self._journal is None:
@@ -183,9 +183,10 @@ class Database:
                 self._journal.require_not_cut(self._journal.tail(), held)
 
     def _require_record(self, *, signs: bool) -> int:
-        """The number of the journal's line that the database holds. Raises RecordDamagedError unless both agree.
+        """Return the number of the journal's line that the database holds.
 
-        Called with the write lock held. What is signed is looked at closely, and so is a write once a second.
+        Raises RecordDamagedError unless both agree. The caller holds the write lock. What is signed
+        is looked at closely, and so is a write once a second.
         """
         assert self._journal is not None
         held, tail = self._looked_up(closely=signs), self._journal.tail()
@@ -234,7 +235,7 @@ class Database:
         return int(held)
 
     def _missing(self, fresh: sqlite3.Connection, *, changed: bool) -> list[str]:
-        """Chains whose last event is gone; if the file has `changed`, also those that have lost any other event.
+        """Return chains whose last event is gone; if the file has `changed`, also those that lost any other event.
 
         Raises sqlite3.DatabaseError if the changed file does not fit together, as an older one under a newer log.
         """

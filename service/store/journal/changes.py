@@ -54,7 +54,7 @@ def forget(connection: sqlite3.Connection) -> None:
 
 
 def changed_rows(connection: sqlite3.Connection) -> list[RowImage]:
-    """The rows that the present transaction has changed, as they now are, in the order of their first change."""
+    """Return the rows that the present transaction has changed, as they are now, in order of their first change."""
     keys = ", ".join(f"k{index}" for index in range(_MOST_KEYS))
     asked = f"SELECT name, {keys} FROM {_TOUCHED} GROUP BY name, {keys} ORDER BY min(rowid)"
     images: list[RowImage] = []

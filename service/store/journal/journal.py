@@ -273,7 +273,7 @@ def _split(content: bytes) -> list[bytes]:
 
 
 def _next(found: Tail | None, raw: bytes, offset: int, place: tuple[int, int]) -> Tail | None:
-    """The tail with one more piece of the file: a mark, a line, or what a power cut left, which does not count."""
+    """Return the tail with one more piece of the file: a mark, a line, or what a power cut left, which is void."""
     mark = parse_mark(raw)
     if mark is not None:
         fits = found is not None and (mark.number, mark.sha256) == (found.number, found.sha256)

@@ -179,7 +179,7 @@ def _journal_again(
 
 
 def _named_with_a_copy(data_dir: Path, actor: Callable[[Path], str], files: Files) -> str:
-    """The person's name, by the accounts in a copy of the database: the folder itself does not open as it is."""
+    """Return the person's name, by the accounts in a copy of the database: the folder itself does not open."""
     with _work_folder(data_dir, files) as work:
         with (
             closing(sqlite3.connect(database_path(data_dir))) as original,

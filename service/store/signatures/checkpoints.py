@@ -31,14 +31,14 @@ _COLUMNS = tuple(field.name for field in fields(Checkpoint))
 
 
 def statement(checkpoint: Checkpoint) -> bytes:
-    """The bytes that are signed: RFC 8785 canonical JSON of every field except the signature, with the purpose."""
+    """Return the bytes that are signed: RFC 8785 canonical JSON of all fields but the signature, with the purpose."""
     named = asdict(checkpoint)
     del named["signature"]
     return canonical(named | {"purpose": PURPOSE}).encode()
 
 
 def key_fingerprint(public_key: bytes) -> str:
-    """SHA-256 (hexadecimal) of the 32 raw bytes of an Ed25519 public key, which people write down and compare."""
+    """Return the SHA-256 (hexadecimal) of the 32 raw bytes of an Ed25519 public key, for people to compare."""
     return hashlib.sha256(public_key).hexdigest()
 
 

@@ -64,7 +64,7 @@ class SecondPlace:
     def of(
         cls, data_dir: Path, copy: Path | None, clock: Clock, files: Files, *, patience_s: float = _PATIENCE_S
     ) -> Self:
-        """That of a data folder whose log of signatures is copied to `copy`, and its journal to a file beside it.
+        """Return the second place of a folder whose log of signatures is copied to `copy`, and its journal beside it.
 
         `copy` is None if it has no second place.
         """
@@ -115,7 +115,7 @@ class SecondPlace:
         done.set()
 
     def _written(self) -> tuple[Path, str] | None:
-        """Bring every copy up to date; else which one failed, and why."""
+        """Bring every copy up to date; return the one that failed and why, None if none did."""
         for one in self._copies:
             try:
                 one.bring_up_to_date()
@@ -198,7 +198,7 @@ class LogCopy:
 
 
 def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between the log and its copy, and between the journal and the copy beside it.
+    """Return faults and notes on differences between the log, or the journal, and its copy.
 
     Raises:
         StoreError: the copy is missing or cannot be read.

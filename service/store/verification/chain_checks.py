@@ -98,7 +98,7 @@ class ChainFacts:
         self._last_utc = at_utc
 
     def backwards_notes(self, run_id: str) -> list[str]:
-        """A note, if times run backwards within the chain: the order of the events is that of their numbers."""
+        """Return a note if times run backwards within the chain: the order of events is that of their numbers."""
         if not self.backwards:
             return []
         seq, back_s = self.backwards[0]
@@ -210,7 +210,7 @@ def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str
 
 
 def _payload_of(row: Mapping[str, Any]) -> tuple[Any, tuple[ArtefactRef, ...], str]:
-    """(payload as plain data, its references, "") of a valid event; (None, (), what is wrong) of an invalid one."""
+    """Return (payload as plain data, references, "") of a valid event, (None, (), problem) of an invalid one."""
     try:
         payload = parse_canonical(row["payload"])
         PAYLOAD.validate_python(payload)

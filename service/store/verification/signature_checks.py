@@ -110,7 +110,7 @@ def _fault(item: Checkpoint, what: str) -> Fault:
 
 
 def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[Fault]:
-    """The site's chain records the end of the run's chain at each start of the service; each must still be there."""
+    """Yield ends of the run's chain, recorded in the site's chain at starts of the service, that are not there."""
     for start_seq, heads in site.heads_at_start:
         if run_id in heads:
             seq, sha256 = heads[run_id]
@@ -148,7 +148,7 @@ def stamp_faults(
 
 
 def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:
-    """Runs recorded as signed in the site's chain that are now missing, shorter or different: cut or deleted."""
+    """Yield runs recorded as signed in the site's chain that are now missing, cut or different."""
     gone: set[str] = set()
     for at, payload in site.runs_signed:
         run_id, seq = str(payload["run"]), int(payload["seq"])

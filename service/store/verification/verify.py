@@ -202,7 +202,7 @@ def _log_findings(
 def _check_chains(
     connection: Connection, evidence: EvidenceRows, files: Mapping[str, FileState] | None
 ) -> tuple[dict[str, ChainFacts], dict[str, list[Fault]]]:
-    """The facts and the faults of the site's chain and of each run's, by run; `files` None: they were not read."""
+    """Return facts and faults of the site's chain and of each run's, by run; `files` None: they were not read."""
     chains = {SITE: ChainFacts()} | {run: ChainFacts() for run in evidence.run_ids}
     found: dict[str, list[Fault]] = {run: [] for run in chains}
     for run, facts in chains.items():

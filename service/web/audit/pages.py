@@ -177,7 +177,7 @@ _READ = [Depends(requires("read"))]
     "/audit/runs/{run_id}/corrections", name="audit_corrections", dependencies=_READ, response_class=HTMLResponse
 )
 def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: int = 1) -> Response:
-    """Old and new: corrected values, steps done again, views taken again."""
+    """Show old and new: corrected values, steps done again, views taken again."""
     frame = audit_frame(audit, run_id, "/corrections")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)

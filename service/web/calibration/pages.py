@@ -108,7 +108,7 @@ def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
 
 @router.get("/runs/{run_id}/board-plan.svg", name="board_plan", dependencies=[Depends(requires("read"))])
 def board_plan(site: CurrentSite, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
-    """The board images of a calibration step as they are planned: corners over the image, and the camera's places."""
+    """Show the planned board images of a calibration step: corners over the image, and the camera's places."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.boards import board_plan_of  # noqa: PLC0415
 

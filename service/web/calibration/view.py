@@ -159,7 +159,7 @@ def charts_of(calibration: Calibration) -> Charts | None:
 
 
 def hand_eye_chart(calibration: Calibration) -> DotPlot | None:
-    """Distance of the board as each image places it from its place by the others; None without a hand-eye."""
+    """Return how far each image places the board from its place by the others; None without a hand-eye."""
     best = calibration.best
     if best is None:
         return None
@@ -207,7 +207,7 @@ def image_rows(calibration: Calibration) -> list[ImageRow]:
 
 
 def held_out_mm(calibration: Calibration) -> tuple[float, float] | None:
-    """Median and maximum error of the board's position by images that the hand-eye calibration did not use, mm."""
+    """Return median and maximum error of the board's position, mm, by images that the hand-eye did not use."""
     if calibration.best is None:
         return None
     values = list(calibration.best.residuals.held_out_mm.values())

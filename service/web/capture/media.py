@@ -45,7 +45,7 @@ _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]+")
 
 @router.get("/vendor/plotly.js", name="plotly_script", response_class=FileResponse)
 def plotly_script(request: Request, site: CurrentSite) -> Response:
-    """plotly's script from the installed package; the 3D view loads it in its sandboxed frame."""
+    """Serve plotly's script from the installed package; the 3D view loads it in its sandboxed frame."""
     path = _plotly()
     stat = path.stat()
     tag = f'"{stat.st_size:x}-{stat.st_mtime_ns:x}"'
@@ -200,7 +200,7 @@ def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
 
 
 def mark_source(log: RunRecord, capture: Capture, device: str = "") -> str:
-    """A key of what would be drawn over an image, which changes when better outlines are known; "" for nothing."""
+    """Return a key of what would be drawn over an image; it changes with better outlines and is "" for nothing."""
     from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
 
     found = outlines_of(log, capture, device)

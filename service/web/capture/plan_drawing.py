@@ -105,7 +105,7 @@ def _apart(symbols: Sequence[Symbol], chosen: str) -> list[Symbol]:
 
 
 def _short(name: str) -> str:
-    """v1_003 → 3; a name without a number stays."""
+    """Shorten a name: v1_003 → 3; a name without a number stays."""
     number = re.search(r"(\d+)$", name)
     return number.group(1).lstrip("0") if number and not re.search(r"t\d+[+-]\d+$", name) else name
 

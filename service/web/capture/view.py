@@ -184,7 +184,7 @@ def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[No
 
 
 def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
-    """Sharp, exposed, spheres, pose, settings: in words, with the figures behind them."""
+    """List the verdicts on an image, with their figures: sharp, exposed, spheres, pose, settings."""
     of_board = capture.payload.artefacts[0].kind == "board_image"
     found = [_board(log, step, capture)] if of_board else looked_at(capture.live, [o.live for o in others])
     return [*found, *_taken(log.protocol, capture)]

@@ -133,7 +133,7 @@ def theme(
     theme: Annotated[Literal["light", "dark", "auto"], Form()],
     back: Annotated[str, Form(max_length=400)] = "/",
 ) -> RedirectResponse:
-    """Light or dark on this screen, remembered by its browser."""
+    """Switch to light or dark on this screen; its browser remembers it."""
     # Only pages of this site: neither //elsewhere nor /\elsewhere.
     inside = back.startswith("/") and not back.startswith(("//", "/\\"))
     response = RedirectResponse(back if inside else "/", status_code=303)
@@ -142,7 +142,7 @@ def theme(
 
 
 def _in_order(site: Site, found: Collection[str]) -> list[RunRow]:
-    """The found runs: first those that a process drives, then other open ones, then ended ones, each newest first."""
+    """Return the found runs: those that a process drives, then open ones, then ended ones, each newest first."""
     driven = set(site.launcher.driven_runs())
     under_way = site.store.open_runs() | driven
     newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]

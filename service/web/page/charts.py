@@ -146,7 +146,7 @@ def vector_field(
     title: str,
     least: int = 5,
 ) -> VectorField:
-    """Vectors (rows, columns, 2) in px, exaggerated so that the longest fills a cell; cells with few are left out."""
+    """Return vectors (rows, columns, 2) in px, scaled so that the longest fills a cell, without cells of few."""
     rows, columns = len(vectors), len(vectors[0])
     width = WIDTH - _LEFT - _RIGHT
     inner = width * image_px[1] / image_px[0]

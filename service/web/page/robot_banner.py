@@ -136,7 +136,7 @@ def _present(  # noqa: PLR0911 - one return a case
 
 
 def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
-    """No arm is connected: never yet, not any more, or because it could not be."""
+    """Return the banner while no arm is connected: never yet, not any more, or because it could not be."""
     title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
     if connected_arms(state):
         text = f"It was connected, and is being connected again. Take it as moving. {NOT_THE_STOP}"
@@ -159,7 +159,7 @@ def _left(state: RunState, snapshot: Snapshot) -> bool:
 
 
 def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
-    """The program ended while arms were connected; that is not in the record before it starts again."""
+    """Return the banner if the program ended while arms were connected, which the record shows only later."""
     arms = connected_arms(state)
     at_utc = datetime.fromtimestamp(snapshot.at_utc_s, UTC).isoformat() if snapshot.at_utc_s else state.at_utc
     told = (
@@ -185,7 +185,7 @@ def busy_words(snapshot: Snapshot) -> str:
 
 
 def _starved(snapshot: Snapshot) -> str:
-    """That the computer is too busy, where that is a good part of the time."""
+    """Say that the computer is too busy, where that is a good part of the time."""
     if snapshot.starved_s < max(1.0, 0.2 * snapshot.quiet_s):
         return ""
     return f", of which it waited {snapshot.starved_s:.0f} s for a processor"

@@ -51,12 +51,12 @@ def sentence(text: str) -> str:
 
 
 def station_of(step: Step) -> str:
-    """`station 1` of a capture step; "" for others."""
+    """Return the station of a capture step as `station 1`; "" for other steps."""
     return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in planned_sets(step)))
 
 
 def count(amount: int, one: str, many: str = "") -> str:
-    """`1 image`, `8 images`."""
+    """Return a number of images as `1 image`, `8 images`."""
     return f"{amount} {one if amount == 1 else many or one + 's'}"
 
 
@@ -88,7 +88,7 @@ def needs(verdict: GateVerdict) -> str:
 
 
 def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) -> str:
-    """Why a run is stopped and what is recommended: `Coverage 0.896, needs at least 0.9 → take these 6 views`."""
+    """Say why a run is stopped and what is recommended: `Coverage 0.896, needs at least 0.9 → take these 6 views`."""
     now = state.step
     failed = [needs(verdict) for verdict in now.verdicts if not verdict.passed]
     if now.failure is not None:
@@ -100,7 +100,7 @@ def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) ->
 
 
 def way_words(state: RunState, way: WayOn) -> str:
-    """A way on in few words, with a small letter: the views that mend are counted, an advice is cut at its end."""
+    """Describe a way on in few words, with a small letter: mending views are counted, an advice is cut at its end."""
     mends = state.step.mend or Mending()
     views = len(mends.viewpoints)
     if way.verb == "confirm" and views:
@@ -121,7 +121,7 @@ _STANDINGS: dict[GateStanding, tuple[str, str]] = {
 
 
 def gate_word(verdict: GateVerdict, *, accepted: bool = False) -> tuple[str, str]:
-    """The outcome of a gate as a word and its tone. `accepted`: a person accepted the figures outside the limits."""
+    """Return a gate's outcome as a word and its tone. `accepted`: a person accepted figures outside the limits."""
     return _STANDINGS[standing(verdict, accepted=accepted)]
 
 

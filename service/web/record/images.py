@@ -217,7 +217,7 @@ class BoardUse:
 
 
 def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str, BoardUse]:
-    """The uses of a step's valid board images by SHA-256: from their own jobs first, later from the calibration."""
+    """Return the use of a step's valid board images by SHA-256: by their own jobs first, later by the calibration."""
     state = run.steps[step]
     images = {
         payload.artefacts[0].sha256: payload

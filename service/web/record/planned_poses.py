@@ -70,7 +70,7 @@ _OF_PLANS = (BOARD_POSES, SUGGESTION)
 
 
 def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[PlannedPose, ...]]:
-    """Computed once for each first event (protocol, rig) and set of the step's notes, which determine the poses."""
+    """Compute poses once for each first event (protocol, rig) and set of the step's notes: these determine them."""
     notes = tuple(note.seq for note in log.state.steps[step.id].notes if note.note in _OF_PLANS)
     key = (log.events[0].sha256, step.id, notes)
     with _lock:

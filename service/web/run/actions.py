@@ -315,7 +315,7 @@ def cancel(
 
 
 def _action(form: ActionForm, state: RunState, who: Identity | None) -> OperatorAction:
-    """The event of a form; `who` is the person who identified themselves for this action, if anybody had to."""
+    """Return the event of a form; `who` is the person who identified themselves for this action, if one had to."""
     reason = full_reason(form.preset, form.reason)
     return OperatorAction(
         action=form.verb,
@@ -358,7 +358,7 @@ def _require_shown(log: RunRecord, form: ActionForm) -> None:
 
 
 def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> None:
-    """A page that shows an earlier question must not answer a later one."""
+    """Refuse the answer of a page that shows an earlier question."""
     state = log.state
     since = (event.payload for event in log.events[seen_seq:])
     if (step, attempt) != (state.current, state.step.attempt) or not all(isinstance(p, _HARMLESS) for p in since):
@@ -366,7 +366,7 @@ def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> 
 
 
 def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
-    """A redo does what its form said: from where the run was, of that image, and with that motion or none."""
+    """Refuse a redo that differs from what its form said: the run's place, the image, whether the robot moves."""
     state = log.state
     if (form.current, form.attempt) != (state.current, state.step.attempt):
         raise out_of_date(state)
@@ -385,7 +385,7 @@ def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
 
 
 def _require_losses_seen(log: RunRecord, seen_seq: int) -> None:
-    """Whoever lets the robot move says to have looked at an arm whose connection was lost, so the page said so."""
+    """Refuse to let the robot move if the page did not show every arm whose connection was lost."""
     moves = log.protocol.step(log.state.current).moves_robot
     if moves and any(loss.seq > seen_seq for loss in lost_arms(log.state).values()):
         raise out_of_date(log.state)

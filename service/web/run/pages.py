@@ -99,7 +99,7 @@ _CHECK_S = 5.0
 
 @router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
 async def stream(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> StreamingResponse:
-    """`changed` with {"seq", "monitor", "locked"} whenever one of them has changed.
+    """Send `changed` with {"seq", "monitor", "locked"} whenever one of them has changed.
 
     `replaced` ends the stream: the sign-in has opened more streams than it may have, and this is the oldest.
     """
@@ -146,7 +146,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 
 def newest(site: Site, run_id: str) -> tuple[int, int]:
-    """The last event, and a number that changes with the runner's reports, its silence, control, and a coat's age.
+    """Return the last event, and a number that changes with the runner's reports or silence, control, a coat's age.
 
     Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.
     """
@@ -282,7 +282,7 @@ def _about(log: RunRecord) -> list[tuple[str, str]]:
 
 
 def _board_plan(log: RunRecord, step: str) -> int:
-    """Version of the plan of a step's board images: one more than the plans that are recorded; 0 for other steps."""
+    """Return the version of a step's plan of board images: one more than the recorded plans; 0 for other steps."""
     if getattr(log.protocol.step(step).params, "board_poses", None) is None:
         return 0
     return 1 + sum(note.note == "board_poses" for note in log.state.steps[step].notes)
@@ -332,7 +332,7 @@ def _drawings() -> dict[str, Markup]:
 
 
 def drawing(step: Step) -> Markup:
-    """The drawing of a step, to stand in a page: one of ours, or the SVG of a plug-in's kind; empty without one."""
+    """Return a step's drawing, to stand in a page: one of ours, or the SVG of a plug-in's kind; empty without one."""
     kind = step_kinds().get(step.kind)
     own = "" if kind is None else kind.drawing
     found = _drawings().get(step.drawing or own)

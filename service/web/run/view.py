@@ -261,7 +261,7 @@ def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) ->
 
 
 def _again(protocol: Protocol, state: RunState, decision: object) -> MainAction | None:
-    """Another attempt: what the step asks for in its normal course, or one more try after something went wrong."""
+    """Offer another attempt: what the step asks for in its normal course, or one more try after a failure."""
     moves, wanted = protocol.step(state.current).moves_robot, state.step.in_course
     if wanted is not None:
         return MainAction("confirm", wanted.does, "What was taken before is kept.", hold=moves)

@@ -88,7 +88,7 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str],
 
 
 def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> CaptureProgress:
-    """Counted from the record; the time left from the times between this run's own exposures."""
+    """Count the progress from the record; estimate the time left from the times between this run's own exposures."""
     data_set = [s for s in protocol.steps if getattr(s.params, "purpose", "") == "dataset"]
     total = sum(planned_views(step) for step in data_set)
     done = sum(min(len(state.steps[step.id].captured), planned_views(step)) for step in data_set)
@@ -117,7 +117,7 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
 
 
 def view_intervals_s(events: Sequence[Event], step: str | None = None) -> list[float]:
-    """Seconds between two exposures of the same attempt of a step, without a restart or a person's act in between."""
+    """Return seconds between exposures of the same attempt of a step, without a restart or a person's act between."""
     chains: list[list[tuple[str, int, float]]] = [[]]
     for event in events:
         if isinstance(event.payload, SessionStarted | OperatorAction):  # a pause is not the time of a view

@@ -118,7 +118,7 @@ def _registered(log: RunRecord, registered: DisplayedRegistration) -> KnownScene
 
 
 def _wound(log: RunRecord) -> tuple[Point, ...]:
-    """The outline of the wound that the last fusion used, in the frame of the scan; empty where there is none."""
+    """Return the outline of the wound that the last fusion used, in the frame of the scan; empty without one."""
     steps = [log.state.steps[step.id] for step in log.protocol.steps if step.gives == "ground_truth"]
     jobs = [job for step in steps for job in step.jobs.values()]
     done = [job for job in jobs if job.kind == fuse.KIND.name and job.status == "finished"]
@@ -127,7 +127,7 @@ def _wound(log: RunRecord) -> tuple[Point, ...]:
 
 
 def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], list[str]]:
-    """T_scan_base by station: from this registration, or from one of the same run that keeps the stations apart."""
+    """Return T_scan_base by station, of this registration or of one of the run that keeps the stations apart."""
     known_registrations = registrations(log.protocol, log.state)
     known = [record, *(known_registrations[n] for n in _WITH_STATIONS if n in known_registrations)]
     for candidate in known:
@@ -141,7 +141,7 @@ def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], 
 
 
 def _live(log: RunRecord) -> KnownScene | None:
-    """The scene in the CT frame, by the newest provisional registration of each station; None while there is none."""
+    """Return the scene in the CT frame, by each station's newest provisional registration; None without one."""
     records: dict[str, LivePose] = {}
     for step in log.protocol.steps:
         for capture in captures_of(log, step.id):
