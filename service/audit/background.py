@@ -34,14 +34,14 @@ STOPPED = 128 + signal.SIGTERM  # exit status of a child that was stopped and ha
 class ChildState:
     """The state of the running child process, or the result of the last one."""
 
-    by: str  # who asked for it
+    by: str  # account of the person who asked for it
     since_utc: str
     what: str = "starting"
     done: int = 0
     total: int = 0
     problem: str = ""  # why there is no result
     remedy: str = ""
-    stopped: bool = False  # by a person
+    stopped: bool = False  # true if a person stopped it
     result: Any = None  # plain data, once there is one
 
     @property
@@ -229,8 +229,8 @@ class PartialResult(Generic[T]):
 
     value: T
     seq: int  # the last event that it covers
-    last: int  # of the run
-    sha256: str  # of that event
+    last: int  # number of the run's last event
+    sha256: str  # hash of that event
 
 
 @dataclass(frozen=True, slots=True)

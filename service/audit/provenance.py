@@ -35,12 +35,12 @@ class Node:
     key: str
     is_job: bool
     step: str
-    kind: str  # of the files, or of the jobs
+    kind: str  # kind of the files, or of the jobs
     count: int
     first_seq: int
     failed: int = 0  # jobs that failed
     device: str = ""
-    seqs: tuple[int, ...] = ()  # of the first few events
+    seqs: tuple[int, ...] = ()  # numbers of the first few events
 
 
 @dataclass
@@ -198,7 +198,7 @@ class Origin:
     """The origin of a file, and what was made from it."""
 
     records: Sequence[ArtefactRow]  # the first says where it came from
-    event: EventRow  # that brought it
+    event: EventRow  # the event that brought it
     job: EventRow | None  # job_enqueued event of the computation that made it
     inputs: Sequence[ArtefactRow]  # the files that it was computed or decoded from
     input_count: int

@@ -267,13 +267,13 @@ class _Result:
     dataset: str
     report: str
     audit_ok: bool
-    dataset_files: int  # of which each has the hash that is listed
+    dataset_files: int  # number of files, each of which has the hash that is listed
     chamfer_mm: float  # CT and scan, both ways
     ct_to_scan_mm: float
     scan_to_ct_mm: float
     ct_to_scan_median_mm: float  # the means hold what only one of them shows
     scan_to_ct_median_mm: float
-    chamfer_floor_mm: float  # what equal surfaces would give
+    chamfer_floor_mm: float  # distance that equal surfaces would have
     duration_s: float
     table_note: str
 

@@ -227,7 +227,7 @@ def _unread(listing: ImportList) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _PhotographsOfRole:
-    """Counts, cameras, lenses, dates (EXIF; "" if not stated) and sizes of the photographs with one role."""
+    """Counts, cameras, lenses, dates (EXIF; "" if missing) and sizes of the photographs with one role."""
 
     count: int
     raw_files: int

@@ -242,7 +242,7 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
 
 
 def optics_of(file: Path) -> Optics:
-    """Return the optics stated in a file's EXIF.
+    """Return the optics in a file's EXIF.
 
     Raises:
         DataError: the file is not an image.

@@ -206,7 +206,7 @@ class TerminalOperator(_Operator):
     """A person who types; the terminal is polled, so that pedal and web can answer as well."""
 
     descriptor: int = 0  # file descriptor of the terminal
-    preview: Callable[[str], str] = lambda _step: ""  # what a step will do, in words; "" if unknown
+    preview: Callable[[str], str] = lambda _step: ""  # describes what a step will do; "" if unknown
     people: People | None = None  # accounts of the site, for actions that need a role
     who: Identity | None = None  # the person who types
     _asked: AskOperator | None = None

@@ -70,7 +70,7 @@ def by(run: FoundRun) -> str:
 
 
 def result_words(run: FoundRun) -> str:
-    """Return a run's result in words, such as `completed, 0.213 mm (within), released`."""
+    """Return a run's result as text, such as `completed, 0.213 mm (within), released`."""
     words = [RESULT_WORDS[run.status]]
     if run.accuracy is not None:
         words.append(run.accuracy.words)

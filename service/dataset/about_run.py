@@ -34,7 +34,7 @@ def about_run(
         summary: the run.
         own: the name of its registration.
         not_in_yet: texts on results that have not arrived yet.
-        stated: replaces what the protocol states.
+        stated: the statement that replaces the protocol's.
         version: the data set's version.
         personal: False leaves people and serial numbers out.
     """
@@ -68,7 +68,7 @@ def about_run(
 
 
 def gates_in_words(summary: RunSummary) -> dict[str, tuple[str, ...]]:
-    """Return each judged step's gates in words, with their verdicts."""
+    """Return each judged step's gates as text, with their verdicts."""
     steps = {step.id: summary.state.steps[step.id] for step in summary.protocol.steps}
     return {
         name: tuple(

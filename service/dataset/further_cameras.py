@@ -44,7 +44,7 @@ class KnownFurtherCamera:
 
     @property
     def outer(self) -> str:
-        """The frame in which its pose is stated, in words."""
+        """A text on the frame in which its pose is given."""
         return "the scan" if self.mounted == "fixed" else "the first camera"
 
     @property

@@ -24,9 +24,9 @@ NOT_STATED = "not stated"
 
 @dataclass(frozen=True, slots=True)
 class UsedDevice:
-    """A device as it stated itself when it was opened; "" for what it did not state or what is left out."""
+    """A device as it identified itself when it was opened; "" for what it did not report or what is left out."""
 
-    name: str  # in rig.yaml
+    name: str  # the name in rig.yaml
     model: str
     serial: str
     firmware: str
@@ -96,18 +96,18 @@ class About:
 
     @property
     def title(self) -> str:
-        """The title that was stated; else the protocol's, and the specimen."""
+        """The title that was given; else the protocol's, and the specimen."""
         known = [self.protocol_title or "Posed images and a surface mesh", self.specimen]
         return self.stated.title or ": ".join(filter(None, known))
 
     @property
     def licence(self) -> str:
-        """The licence in words."""
+        """The text of the licence."""
         return self.stated.licence or "No licence was stated: ask the site that made the data set"
 
     @property
     def licence_address(self) -> str:
-        """The address of the licence; "" where none was stated, or one in words as old protocols have it."""
+        """The address of the licence; "" where none was given, or a text as old protocols have it."""
         try:
             return licence_address(self.stated.licence)
         except DataError:
@@ -115,7 +115,7 @@ class About:
 
     @property
     def ethics(self) -> str:
-        """The ethics statement in words."""
+        """The text of the ethics statement."""
         return self.stated.ethics or "No ethics statement was given, neither in the protocol nor at the export"
 
     @property
@@ -136,7 +136,7 @@ class About:
 
     @property
     def doi(self) -> str:
-        """The address of the data set's DOI, if it was stated and is one."""
+        """The address of the data set's DOI, if it was given and is one."""
         try:
             return doi_address(self.stated.doi)
         except DataError:
@@ -144,7 +144,7 @@ class About:
 
     @property
     def citation(self) -> str:
-        """How to cite it: as stated, else put together from the record."""
+        """The citation: the given one, else one put together from the record."""
         if self.stated.cite:
             return self.stated.cite
         names = ", ".join(maker.name for maker in self.creators)
@@ -155,7 +155,7 @@ class About:
 
 
 def _party(text: str, otherwise: Literal["Person", "Organization", ""] = "") -> Party:
-    """Return a stated person or body; one that an older record has in a wrong form is named as it stands there."""
+    """Return a given person or body; one that an older record has in a wrong format is named as it stands there."""
     try:
         return party(text, otherwise=otherwise)
     except DataError:
@@ -201,7 +201,7 @@ class Mesh:
         vertices_m: (V, 3) in the world frame.
         faces: (F, 3).
         source: (V,) where each vertex comes from, 0: CT, 1: scan, 2: blend; None: all from the scan.
-        sigma_m: (V,) stated standard deviation along the normal; None: not stated.
+        sigma_m: (V,) standard deviation along the normal; None: not known.
     """
 
     vertices_m: Array

@@ -206,10 +206,10 @@ def _finished(protocol: Protocol, state: RunState, gives: Gives, job_kind: str) 
 class LateResult:
     """One row of the evaluation's table that arrived after the evaluation was made."""
 
-    seq: int  # of the event that brought it
+    seq: int  # number of the event that brought it
     at_utc: str
     step: str
-    name: str  # of the registration
+    name: str  # the registration's name
     text: str
 
 

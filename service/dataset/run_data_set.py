@@ -128,7 +128,7 @@ def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple
 def _pixels(
     summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[PosedView], mesh: Mesh, *, personal: bool
 ) -> tuple[Photographs, str]:
-    """Return photographs, depth and masks of the views, and what the masks hold, in words."""
+    """Return photographs, depth and masks of the views, and a text on what the masks hold."""
     standing, others = _spheres(summary)
     posts = posts_of(summary, standing, views)
     pixels = Photographs(
@@ -226,7 +226,7 @@ def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
     step = registered_scan(summary.protocol, summary.state)
     kept = summary.state.steps[step].artefacts if step else ()
     refs = [ref for ref in kept if ref.kind == "scan_mesh_original"]
-    named: dict[str, str] = {}  # by the last part of the name, in lower case and with accents composed
+    named: dict[str, str] = {}  # full names by the last part of the name, in lower case and with accents composed
     for ref in refs:
         if ref.original_name.lower().endswith(_REFERRING):
             with summary.store.artefact_path(ref.sha256).open("rb") as file:

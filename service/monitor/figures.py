@@ -51,7 +51,7 @@ class DrivenRun:
     run_id: str
     doing: Doing
     robot: RobotPhase
-    silent_s: float  # since its runner last reported; inf: never
+    silent_s: float  # seconds since its runner last reported; inf: never
     viewpoint_s: float | None  # median time between the last exposures of one step; None: too few yet
 
 

@@ -227,7 +227,7 @@ class Reporter:
     _heartbeat: Heartbeat = field(init=False)
     _moment: _Moment | None = None
     _attends: tuple[int, float] = (0, 0.0)  # the main loop's thread, and how long it had waited for a processor
-    _tower_light: TowerLight | None = None  # that the signal tower shows
+    _tower_light: TowerLight | None = None  # the light that the signal tower shows
     _light: LightReading = field(default_factory=LightReading)
     _camera: CameraReading = field(default_factory=CameraReading)
     _due_s: dict[str, float] = field(default_factory=dict[str, float])

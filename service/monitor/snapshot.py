@@ -50,9 +50,9 @@ class Snapshot(Record):
     at_utc_s: float = 0.0
     attended_utc_s: float = 0.0  # 0: same as at_utc_s
     robot_utc_s: float = 0.0  # 0: same as attended_utc_s
-    starved_s: float = 0.0  # for which the main loop waited for a processor since its last report
+    starved_s: float = 0.0  # seconds for which the main loop waited for a processor since its last report
     activity: str = ""  # the long call of the main loop, in words
-    activity_utc_s: float = 0.0  # when it began
+    activity_utc_s: float = 0.0  # the time when it began
     pid: int = 0
     doing: Doing = "unknown"
     step: str = ""
@@ -62,14 +62,14 @@ class Snapshot(Record):
     total: int = 0
     messages: tuple[Message, ...] = ()  # newest last
     robot: RobotPhase = "unknown"
-    robot_name: str = ""  # in rig.yaml
+    robot_name: str = ""  # the name in rig.yaml
     speed_fraction: float | None = None
     camera_battery_fraction: float | None = None
     camera_free_bytes: int | None = None
     light_lux: float | None = None
     temperature_c: float | None = None
     disk_free_bytes: int | None = None
-    asks: Asks = ""  # what people are asked for now
+    asks: Asks = ""  # the thing that people are asked for now
     question: str = ""
     pedal_armed: bool = False  # pressed once; a second press lets the robot move
 

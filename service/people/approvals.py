@@ -24,7 +24,7 @@ class Approval:
     payload: ProtocolApproved
     by: str
     at_utc: str
-    seq: int  # in the site's chain
+    seq: int  # number of the event in the site's chain
 
 
 @dataclass(frozen=True, slots=True)

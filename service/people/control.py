@@ -38,7 +38,7 @@ class Holder:
     asked_by_account: str = ""
     asked_by_name: str = ""
     asked_utc_s: float = 0.0
-    refused_screen: str = ""  # that asked last and was refused; until somebody asks again, or control changes
+    refused_screen: str = ""  # the one that was refused last; until somebody asks again, or control changes
     refused_utc_s: float = 0.0
 
 

@@ -110,7 +110,7 @@ def require_pin(pin: str) -> None:
 
 
 def plain_badge(typed: str) -> str:
-    """Return a badge's code in the form that is hashed. Raises AccountError if it cannot be a badge's."""
+    """Return a badge's code in the format that is hashed. Raises AccountError if it cannot be a badge's."""
     plain = typed.strip().upper()
     if not _BADGE.fullmatch(plain):
         raise AccountError(

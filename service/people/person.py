@@ -107,7 +107,7 @@ class Account:
     failures: int  # wrong passwords in a row
     locked_until_utc_s: float  # 0 if not locked out
     created_utc: str
-    badge: bool  # whether it has a badge
+    badge: bool  # true if it has a badge
 
 
 @dataclass(frozen=True, slots=True)

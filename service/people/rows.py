@@ -81,7 +81,7 @@ def record_change(
 ) -> Event:
     """Record a change of an account in the transaction that makes it. Returns the event.
 
-    `secrets` holds the stored forms of new secrets by column; only their hashes go into the chain.
+    `secrets` holds new secrets by column, as they are stored; only their hashes go into the chain.
     """
     hashes = {column: sha256_text(value) for column, value in (secrets or {}).items()}
     (event,) = store.append_site(connection, [change.model_copy(update={"stored": hashes})], actor=actor)

@@ -44,7 +44,7 @@ def wait_after_s(failures: int) -> float:
 class SecretOrigin:
     """The place where a secret is typed: a browser's address, a screen that is signed in, or a terminal."""
 
-    address: str = ""  # of the browser that signs in
+    address: str = ""  # address of the browser that signs in
     screen: str = ""
     by: str = ""  # the account that is signed in on the screen
 

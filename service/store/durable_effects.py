@@ -208,7 +208,7 @@ class IdSource(Protocol):
     """The source of names for runs, jobs and tokens; unique within the data folder."""
 
     def new_run(self, at: datetime) -> str:
-        """Return a name for a run begun at `at`; names sort by time."""
+        """Return a name for a run started at `at`; names sort by time."""
         ...
 
     def new_job(self) -> str:

@@ -80,7 +80,7 @@ def file_system(folder: Path) -> str:
 
 
 def _why_no_locks(folder: Path) -> str:
-    """Return what fails of locks and shared memory where it is tried, in words; "" if nothing does."""
+    """Return a text on what fails of locks and shared memory when tried; "" if nothing does."""
     try:
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".probe-") as one, Path(one.name).open("r+b") as other:
             _lock(one.fileno())

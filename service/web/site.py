@@ -91,7 +91,7 @@ class OpenedRuns:
     _runs: dict[str, RunFollower] = field(init=False, default_factory=dict[str, RunFollower])
     # A lock exists only while somebody uses it, so that invented names of runs leave nothing behind.
     _locks: WeakValueDictionary[str, Lock] = field(init=False, default_factory=WeakValueDictionary[str, Lock])
-    _lock: Lock = field(init=False, default_factory=Lock)  # of the two above; held for moments
+    _lock: Lock = field(init=False, default_factory=Lock)  # lock of the two above; held for moments
 
     def now(self, run_id: str) -> RunRecord:
         """Return a run's record as of now. Raises what `first_read` raises, and IntegrityError."""
@@ -115,7 +115,7 @@ class Site:
     store: Store
     people: People
     launcher: Launcher
-    devices_of: Callable[[Rig], Mapping[str, RigDevice]]  # of a rig file, by name
+    devices_of: Callable[[Rig], Mapping[str, RigDevice]]  # returns the devices of a rig file, by name
     secure: bool = True  # cookies are sent over TLS, or to this machine, only
     idle_lock_s: float = 600.0
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask

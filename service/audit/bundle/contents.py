@@ -150,7 +150,7 @@ def readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -
         run_id: the run's identifier.
         key_id: fingerprint of the site's signing key.
         root: the run's first event.
-        missing: results that have not arrived yet, in words.
+        missing: texts on results that have not arrived yet.
     """
     return _TEXT.format(run_id=run_id, key_id=key_id, warnings=_warnings(root, missing))
 
@@ -199,7 +199,7 @@ class BundledRun:
         site_head: the head of the site's chain.
         artefacts: every recorded file, once for each event that brought it.
         full_names: people's full names, by account.
-        missing: results that have not arrived yet, in words.
+        missing: texts on results that have not arrived yet.
         keys: the site's public keys, oldest first.
     """
 

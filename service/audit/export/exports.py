@@ -195,7 +195,7 @@ class Exports:
         self._children.wait(run_id, timeout_s)
 
     def unfinished(self, run_id: str) -> list[UnfinishedExport]:
-        """Return exports in a format that were begun and have not ended, newest first."""
+        """Return exports in a format that were started and have not ended, newest first."""
         return unfinished_exports(self.folder, run_id)
 
     def files(self, events: Sequence[Event]) -> list[ExportedFile]:
@@ -272,7 +272,7 @@ _KEY = ""  # the list belongs to no run
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: its name, and what it is in words."""
+    """A format: its name, and a text on what it is."""
 
     name: str
     words: str
@@ -285,7 +285,7 @@ class Formats:
         self._children = ChildProcesses("service.audit.export.exports", "list of formats", clock)
 
     def state(self) -> ChildState | None:
-        """Return the progress or the outcome of the listing; None before it was begun."""
+        """Return the progress or the outcome of the listing; None before it was started."""
         return self._children.state(_KEY)
 
     def known(self, wait_s: float = 0.0) -> tuple[Format, ...]:

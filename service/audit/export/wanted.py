@@ -63,7 +63,7 @@ class ExportRequest:
 
 @dataclass(frozen=True, slots=True)
 class UnfinishedExport:
-    """An export that was begun and has not ended; `writing`: a process is at it."""
+    """An export that was started and has not ended; `writing`: a process is at it."""
 
     name: str
     request: ExportRequest

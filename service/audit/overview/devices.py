@@ -19,7 +19,7 @@ class OpenedDevice:
     """A device as it answered when it was opened."""
 
     row: EventRow  # its device_opened event
-    name: str  # in rig.yaml
+    name: str  # the name in rig.yaml
     report: RecordedReport
 
 
@@ -51,7 +51,7 @@ class ClockSeries:
     """The offset of a device's clock from the host's over a step, as far as one start of the runner did it."""
 
     step: str
-    start: int  # of the runner in this run, counted from 1
+    start: int  # the runner's start in this run, counted from 1
     captures: int
     first_s: float
     last_s: float
@@ -109,7 +109,7 @@ class Session:
 
     row: EventRow
     software: Mapping[str, str]
-    changed: Mapping[str, tuple[str, str]]  # since the session before: distribution → before, now
+    changed: Mapping[str, tuple[str, str]]  # changes since the session before: distribution → before, now
 
 
 def sessions(rows: Sequence[EventRow]) -> list[Session]:

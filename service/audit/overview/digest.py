@@ -61,7 +61,7 @@ class Digest:
     protocol: Protocol | None = None
     state: RunState | None = None  # None if the protocol cannot be read
     failed_gates: list[FailedGate] = field(default_factory=list[FailedGate])
-    times: dict[int, str] = field(default_factory=dict[int, str])  # of deviations and automatic confirmations
+    times: dict[int, str] = field(default_factory=dict[int, str])  # times of deviations and automatic confirmations
     facets: Facets = field(default_factory=Facets)
     problem: str = ""  # why the fold stopped before the end of the chain; "" if it did not
 

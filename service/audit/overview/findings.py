@@ -38,7 +38,7 @@ class CorrectedValue:
     old: Any
     new: Any
     reason: str
-    original: Any  # what the event holds; equals `old`
+    original: Any  # the value in the event; equals `old`
     latest: bool  # no later correction of the same value
 
     @property
@@ -107,7 +107,7 @@ class Attempt:
     attempt: int
     seq: int
     at_utc: str
-    measures: Mapping[str, str]  # as text, with bounds if the measure states any
+    measures: Mapping[str, str]  # measures as text, with bounds if the measure states any
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class ReplacedStep:
     """A step that was done more than once, with the measures of every attempt."""
 
     step: str
-    reasons: Sequence[tuple[int, str]]  # for each superseded attempt: the event, and why
+    reasons: Sequence[tuple[int, str]]  # event and reason of each superseded attempt
     attempts: Sequence[Attempt]
 
     @property
@@ -167,7 +167,7 @@ def _numbers(measures: str | None, uncertainties: str | None) -> Mapping[str, st
 class ReplacedViewpoint:
     """A viewpoint that was retaken: the replaced event, and the one that counts."""
 
-    seq: int  # of the event that superseded it
+    seq: int  # number of the event that superseded it
     step: str
     viewpoint: str
     reason: str

@@ -78,7 +78,7 @@ class Finding:
 
     @property
     def name(self) -> str:
-        """Its kind in words."""
+        """The label of its kind."""
         return _NAMES[self.kind]
 
 

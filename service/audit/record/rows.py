@@ -114,7 +114,7 @@ class EventRow:
     previous_sha256: str
     sha256: str
     artefacts: int
-    job: str = ""  # that it is about
+    job: str = ""  # the job that it is about
 
     def record(self, kind: type[P]) -> P | None:
         """Return the payload as a record of this kind; None if it is of another kind, altered or incomplete."""

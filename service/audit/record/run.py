@@ -48,7 +48,7 @@ class RecordedRun:
     state: RunState
     artefacts: Sequence[Artefact]
     files: RecordedFiles
-    full_names: Mapping[str, str]  # of accounts, as they are now
+    full_names: Mapping[str, str]  # full names by account, as they are now
 
     def summary(self) -> RunSummary:
         """Return the run as the functions of the report and of the data set take it."""

@@ -44,11 +44,11 @@ class Difference:
     path: str
     recorded: Any
     recomputed: Any
-    difference: float | None  # in `unit`; None unless both are numbers
+    difference: float | None  # the difference in `unit`; None unless both are numbers
     relative: float | None  # relative to the largest number of the field
     unit: str
     values: int = 1  # number of values that differ
-    added: bool = False  # what was recorded has no such field
+    added: bool = False  # true if what was recorded has no such field
 
     @property
     def wording(self) -> bool:

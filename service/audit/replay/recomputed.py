@@ -82,8 +82,8 @@ class Drift:
     """Displacement of the scan from its recorded registration, at the centre of its spheres."""
 
     registration: str
-    in_world_mm: float | None  # by T_world_scan; None if the world frame is that of the reconstruction
-    against_cameras_mm: float  # after aligning the cameras
+    in_world_mm: float | None  # drift by T_world_scan; None if the world frame is that of the reconstruction
+    against_cameras_mm: float  # drift after aligning the cameras
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ def result_sentence(summary: RunSummary) -> TableCell:
 
 
 def rests_on(summary: RunSummary) -> tuple[str, ...]:
-    """Return the accepted gates on which the evaluation rests, in words."""
+    """Return texts on the accepted gates on which the evaluation rests."""
     evaluations = [step.id for step in summary.protocol.steps if step.gives == "accuracy"]
     gates = (gate for step in evaluations for gate in depends_on(summary.protocol, summary.state, step))
     return tuple(dict.fromkeys(f"Depends on an accepted gate: {gate.text}" for gate in gates))

@@ -143,7 +143,7 @@ Shape = Rectangle | Line | Label | Raster
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A chart in its own units, scaled to the available width; `text` describes it in words.
+    """A chart in its own units, scaled to the available width; `text` describes it.
 
     `name`: of its file, without suffix; `rows`: the figures that it shows, below a row of their names with units.
     """

@@ -41,7 +41,7 @@ from service.core.text.words import counted
 
 @dataclass(frozen=True, slots=True)
 class NotableEvent:
-    """An event that a reader must know of, in words."""
+    """A text on an event that a reader must know of."""
 
     seq: int
     kind: str
@@ -237,7 +237,7 @@ def _signatures(run: RecordedRun) -> Table:
 
 
 def _meaning(signed: OperatorAction) -> str:
-    """Return the stated meaning of a signature or an acceptance, and how the person was identified."""
+    """Return the recorded meaning of a signature or an acceptance, and how the person was identified."""
     how = "automatic" if signed.automatic else signed.via
     how += {"pin": ", by PIN", "badge": ", by badge"}.get(signed.identified, "")
     said = f"accepted outside its limits, {signed.reason}" if signed.action == "accept" else signed.meaning

@@ -46,7 +46,7 @@ class ComparedRun:
 
 @dataclass(frozen=True, slots=True)
 class ComparedProperty:
-    """One property of both runs, in words; `change`: from the first to the second, "" if there is none."""
+    """One property of both runs as text; `change`: from the first to the second, "" if there is none."""
 
     name: str
     first: str
@@ -160,7 +160,7 @@ def _unit(name: str) -> str:
 
 
 def _change(values: Sequence[float | None], unit: str = "") -> str:
-    """Return the change in words, such as `+0.012 mm`; "" if a value is missing or both are equal."""
+    """Return the change as text, such as `+0.012 mm`; "" if a value is missing or both are equal."""
     first, second = values
     if first is None or second is None or not math.isfinite(apart := second - first) or apart == 0:
         return ""

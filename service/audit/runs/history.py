@@ -27,7 +27,7 @@ class Figure:
     name: str
     unit: str
     of: tuple[InstrumentKind, ...]
-    from_zero: bool = True  # whether its axis begins at 0; a focal length changes by a thousandth only
+    from_zero: bool = True  # its axis starts at 0; a focal length changes by a thousandth only
 
 
 FIGURES: tuple[Figure, ...] = (
@@ -54,7 +54,7 @@ _COLUMNS = (*_MEASURED, *(f"{name}_px" for name in _OF_CAMERA), "mean_radial_err
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """A camera, lens or arm by the maker's model and serial number; "" if not stated."""
+    """A camera, lens or arm by the maker's model and serial number; "" if not known."""
 
     kind: InstrumentKind
     model: str
@@ -74,7 +74,7 @@ class HistoryRow:
     at_utc: str
     camera: Instrument | None
     lens: Instrument | None
-    arms: tuple[Instrument, ...]  # whose flange carried the camera
+    arms: tuple[Instrument, ...]  # the arms whose flange carried the camera
     values: Mapping[str, float]
 
     def instruments(self) -> tuple[Instrument, ...]:
@@ -197,7 +197,7 @@ def _values(steps: Iterable[_CalibrationResult]) -> dict[str, float]:
 def _optical(
     devices: Mapping[str, RecordedIdentity], stated: RecordedOptics
 ) -> tuple[Instrument | None, Instrument | None]:
-    """Return the camera and lens as the photographs state them, else as the camera stated when it was opened."""
+    """Return the camera and lens as the photographs state them, else as the camera reported when it was opened."""
     cameras = (one for name, one in devices.items() if one.kind == "camera" or name == "camera")
     answered = next(cameras, RecordedIdentity())
     model, serial = stated.model or answered.model, stated.body_serial or answered.serial

@@ -469,7 +469,7 @@ def _stream_problem(stream: IO[bytes], info: zipfile.ZipInfo) -> str:
 class Check:
     """One pass over a bundle: faults and notes, in the order in which they were found."""
 
-    files: dict[str, tuple[str, int]]  # as the manifest lists them
+    files: dict[str, tuple[str, int]]  # the files as the manifest lists them
 
     def __init__(self) -> None:
         self.faults: list[dict[str, str]] = []
@@ -1160,7 +1160,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def report(check: Check) -> str:
-    """Return the result in words."""
+    """Return the result as text."""
     counts = check.counts
     simulated = " SIMULATED: no real device took part." if check.manifest["simulated"] else ""
     lines = [

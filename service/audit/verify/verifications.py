@@ -38,7 +38,7 @@ class Outcome(Record):
     artefacts: int
     files: int
     bytes_hashed: int
-    head_sha256: str  # of the last event that it covered
+    head_sha256: str  # hash of the last event that it covered
     faults: tuple[VerifiedFault, ...]
     fault_count: int
     notes: tuple[str, ...]

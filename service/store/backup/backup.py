@@ -41,7 +41,7 @@ class BackupReport:
     """The result of a backup."""
 
     folder: Path
-    name: str  # of the state, for `orthocapture store restore --state NAME`
+    name: str  # the state's name, for `orthocapture store restore --state NAME`
     state: BackupState
     copied: int  # number of files copied this time
     copied_bytes: int
@@ -118,7 +118,7 @@ class _ReferencedFiles:
     sizes: dict[str, int]  # sizes of files, by hash
     heads: dict[str, tuple[int, str]]
     root_sha256: str
-    line: int  # of the journal
+    line: int  # number of the journal's line
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,9 +47,9 @@ class BackupState(Record):
     artefacts: int
     artefact_bytes: int
     heads: dict[str, tuple[int, str]]  # chain → number and hash of its last event
-    root_sha256: str  # of the oldest chain; identifies the data folder
+    root_sha256: str  # root hash of the oldest chain, which identifies the data folder
     with_keys: bool
-    faults: tuple[str, ...]  # in the data folder itself when it was copied; () if it verified
+    faults: tuple[str, ...]  # faults of the data folder itself when it was copied; () if it verified
 
 
 @contextmanager

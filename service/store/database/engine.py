@@ -52,7 +52,7 @@ def database_path(data_dir: Path) -> Path:
 
 
 def read_schema(connection: Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
-    """Return the schema of this database in the form of `fresh_schema`: (type, name) → (table, SQL)."""
+    """Return the schema of this database in the format of `fresh_schema`: (type, name) → (table, SQL)."""
     made = connection.execute(text("SELECT type, name, tbl_name, sql FROM sqlite_master"))
     return {(str(row.type), str(row.name)): (str(row.tbl_name), row.sql) for row in made}
 

@@ -68,7 +68,7 @@ class Mark:
 
     word: Word
     number: int
-    sha256: str  # of the line
+    sha256: str  # hash of the line
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def read_lines(path: Path) -> Iterator[JournalLine | Ending]:
 
 def _lines(stream: Iterable[bytes]) -> Iterator[JournalLine | Ending]:
     end, last = 0, (0, FIRST)
-    waiting: list[tuple[bytes, int]] = []  # what may be the ending: a mark, or what a power cut left
+    waiting: list[tuple[bytes, int]] = []  # lines that may be the ending: a mark, or what a power cut left
     for raw in stream:
         end += len(raw)
         line = parse_line(raw, end)

@@ -80,7 +80,7 @@ class LogEnd:
     """A place in the log where a line ends: the beginning of the log, or how far it was read."""
 
     offset: int = 0  # bytes before it
-    number: int = 0  # of the last line before it
+    number: int = 0  # number of the last line before it
     last_bytes: int = 0  # length of that line
     previous: str = _FIRST  # SHA-256 of that line
 

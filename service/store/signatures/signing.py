@@ -38,10 +38,10 @@ class PublicKey:
 
     key_id: str
     public_key: bytes
-    seq: int  # of its KeyChanged event
+    seq: int  # number of its KeyChanged event
     replaced_seq: int | None  # seq of its successor's KeyChanged; None for the key in use
     reason: str
-    introduced: bool  # whether its predecessor signed its KeyChanged; never for the first key
+    introduced: bool  # true if its predecessor signed its KeyChanged; never for the first key
 
 
 def checkpoint(store: Store, run_id: str) -> Checkpoint:

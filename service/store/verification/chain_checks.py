@@ -32,9 +32,9 @@ class Fault:
     """One fault found by the verification."""
 
     run_id: str | None
-    seq: int | None  # of the event concerned
+    seq: int | None  # number of the event concerned
     file: str
-    what: str  # what is wrong
+    what: str  # the fault as text
 
     def __str__(self) -> str:
         place = ", ".join(
@@ -69,7 +69,7 @@ class ChainFacts:
     key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
     people: list[tuple[Any, str]] = field(default_factory=list[tuple[Any, str]])  # account changes, sign-ins; times
     stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # time_stamp_kept, of the site
-    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of service_started
+    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # heads in service_started
     runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # run_signed, of the site
     written_again: list[tuple[int, SignaturesWrittenAgain]] = field(
         default_factory=list[tuple[int, SignaturesWrittenAgain]]

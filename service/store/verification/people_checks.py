@@ -49,7 +49,7 @@ class _RecordedAccounts:
     """The state of accounts, links and sessions according to the site's chain."""
 
     accounts: dict[str, _AccountState] = field(default_factory=dict[str, _AccountState])
-    links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # by SHA-256 of the stored token_sha256
+    links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # links by SHA-256 of the stored token_sha256
     open_links: dict[str, str] = field(default_factory=dict[str, str])  # account → hash of its valid link
     unhashed_links: set[str] = field(default_factory=set[str])  # accounts with events older than these hashes
     sessions: dict[str, tuple[str, int]] = field(default_factory=dict[str, tuple[str, int]])  # screen → hash, locked

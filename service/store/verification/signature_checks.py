@@ -20,7 +20,7 @@ class KeyPeriod:
 
     key_id: str
     public_key: bytes
-    seq: int  # of its KeyChanged event
+    seq: int  # number of its KeyChanged event
     replaced_seq: int | None  # seq of its successor's KeyChanged; None for the key in use
 
 

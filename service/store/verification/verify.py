@@ -50,7 +50,7 @@ class AuditReport:
     timestamps: int
     unsigned_events: Mapping[str, int]  # run → events after its last checkpoint
     key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first, to compare as well
-    faults: tuple[Fault, ...]  # in the order of the chain
+    faults: tuple[Fault, ...]  # faults in the order of the chain
     notes: tuple[str, ...]
 
     @property

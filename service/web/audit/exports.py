@@ -150,7 +150,7 @@ _LINES = ("creators", "funders")  # fields with one entry on each line
 
 
 class FormatForm(BaseModel):
-    """A data set in a format, as the form has it."""
+    """A data set in a format, as the page's form gives it."""
 
     form: str = Field(max_length=200)
     crop: str = Field("", pattern=r"^([1-9][0-9]{0,5}x[1-9][0-9]{0,5})?$")

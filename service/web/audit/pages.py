@@ -55,7 +55,7 @@ class AccuracyRow:
     reprojection_px: float | None
     images: str
     late: str
-    limit: str  # "" where the protocol sets none
+    limit: str  # "" if the protocol sets none
     within: bool | None
     own: bool  # the run's own registration: what a data set is exported with
 

@@ -33,7 +33,7 @@ class ImageRow:
     residual_deg: float | None
     held_out_mm: float | None
     held_out_deg: float | None
-    sha256: str  # of the photograph
+    sha256: str  # the photograph's hash
     step: str
     use: BoardUse
 

@@ -40,10 +40,10 @@ class CaptureQuery(BaseModel):
     step: str = Field("", max_length=64)
     viewpoint: str = Field("", max_length=64)
     seq: int = Field(0, ge=0, le=2**53)  # event of an image; 0: the newest
-    page: int = Field(1, ge=1, le=100_000)  # of the contact sheet
+    page: int = Field(1, ge=1, le=100_000)  # page of the contact sheet
     views: int = Field(0, ge=0, le=100_000)  # page of the table; 0: the one that shows where the run is
     replaced: bool = False  # list replaced images too
-    plain: bool = False  # without the outlines of spheres
+    plain: bool = False  # leave out the outlines of spheres
     device: str = Field("", max_length=64)  # a further camera, whose images are shown; "": the first one
 
 
@@ -55,17 +55,17 @@ class ViewTable:
     """The viewpoints of a step, and a page of the table that lists them."""
 
     views: list[StepViewpoint]
-    rows: list[StepViewpoint]  # on this page
+    rows: list[StepViewpoint]  # the rows on this page
     page: int
     pages: int
-    counts: Mapping[ViewState, int]  # of all viewpoints; none is 0
+    counts: Mapping[ViewState, int]  # number of viewpoints in each state, without zeros
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSheet:
     """A page of the contact sheet."""
 
-    images: list[SheetImage]  # on this page
+    images: list[SheetImage]  # the images on this page
     devices: list[str]  # further cameras that took images in this step
     replaced: int  # images of the step that no longer count
     page: int
@@ -79,7 +79,7 @@ class ChosenImage:
     capture: Capture | None
     camera: CameraImage | None  # the camera whose image is large
     cameras: list[CameraImage]  # all that exposed at this viewpoint
-    sums: list[Verdict]  # of all images up to this one
+    sums: list[Verdict]  # verdicts on all images up to this one
     registered: bool  # the spheres have the numbers of the registration
 
 
@@ -97,7 +97,7 @@ class StepImages:
         view: the chosen viewpoint.
         redo: the answer to whether it may be redone; None without a chosen viewpoint.
         in_control: the person's screen has control of the run.
-        advice, suggestions: what the images lack, and the views that would help most.
+        advice, suggestions: a text on what the images need, and the views that would help most.
         following: the page shows the newest image.
         query: the query of the page.
         tail: the same as the query of an address, for the parts of the page.
@@ -132,9 +132,9 @@ class CapturePage:
 
     run_id: str
     log: RunRecord
-    steps: list[Step]  # that take images with the robot
+    steps: list[Step]  # the steps that take images with the robot
     held: bool  # a person holds the camera in another step
-    further_cameras: tuple[str, ...]  # of the rig
+    further_cameras: tuple[str, ...]  # the rig's further cameras
     images: StepImages | None  # None where no step takes images with the robot
 
 

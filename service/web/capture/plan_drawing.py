@@ -29,7 +29,7 @@ class Symbol:
     state: ViewState
     x: float
     y: float
-    tip_x: float  # of the line towards what it looks at
+    tip_x: float  # tip of the line towards what it looks at
     tip_y: float
 
 

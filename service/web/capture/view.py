@@ -71,8 +71,8 @@ class StepViewpoint:
     name: str
     station: str
     state: ViewState
-    why: str  # of a failure, of being left out
-    position_m: Vector | None  # of the camera in the base frame of its station
+    why: str  # reason of a failure, or of being left out
+    position_m: Vector | None  # the camera's position in the base frame of its station
     looks: Vector | None  # its optical axis there
     capture: Capture | None  # the valid one
     replaced: int  # captures that no longer count
@@ -95,7 +95,7 @@ class ViewpointRedo:
 
     refused: str
     current: str  # step
-    attempt: int  # of the current step
+    attempt: int  # attempt of the current step
     moves: bool
     paused: bool
 

@@ -40,7 +40,7 @@ class HandheldPage:
     now: HandheldView | None
     attempt: int
     in_control: bool
-    size: float  # of the drawing of the hemisphere
+    size: float  # size of the drawing of the hemisphere
 
 
 @router.get("/runs/{run_id}/held", name="held", dependencies=[Depends(requires("read"))])

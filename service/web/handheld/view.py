@@ -68,7 +68,7 @@ class HandheldView:
     step: Step
     running: bool
     words: str
-    failures: tuple[str, ...]  # of work on the images: what failed, what to do
+    failures: tuple[str, ...]  # failures of work on the images: what failed, what to do
     photographs_from: str  # folder of a camera without a cable; "" for one that can be released from here
     overlay: Overlay | None
     spots: tuple[PlanMarker, ...]

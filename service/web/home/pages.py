@@ -50,7 +50,7 @@ class RunLine:
     robot: str
     standing: tuple[str, str] = ("Under way", "now")  # how it stands, and the tone of it
     why: str = ""  # it is stopped, and what is recommended
-    fault: str = ""  # what is wrong with its record
+    fault: str = ""  # the fault of its record
     about: RunAbout = field(default_factory=RunAbout)
 
 
@@ -63,7 +63,7 @@ class StartableProtocol:
     fault: str = ""
     space: str = ""  # why the disk will not do for it
     standing: ProtocolStanding | None = None
-    changes: tuple[str, ...] = ()  # against the approved content of its id and version
+    changes: tuple[str, ...] = ()  # changes against the approved content of its id and version
 
 
 class HomeQuery(BaseModel):

@@ -175,7 +175,7 @@ def dots(
     limit: float | None = None,
     limit_text: str = "",
 ) -> DotPlot:
-    """Return a dot plot with one mark for each name and series. A limit far above all values is stated, not drawn."""
+    """Return a dot plot with one mark for each name and series. A limit far above all values is named, not drawn."""
     height = 300.0
     inner = height - _TOP - _BOTTOM
     known = [v for _, values in series for v in values if v is not None]

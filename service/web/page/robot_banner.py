@@ -29,16 +29,16 @@ class LookAt:
 
 @dataclass(frozen=True, slots=True)
 class Banner:
-    """The state of the robot, in words."""
+    """The state of the robot as text."""
 
     key: str  # moving, standing, paused, pausing, protective_stop …
     tone: Tone
     icon: str
     title: str
     text: str
-    remedy: str = ""  # what a person does at the robot
+    remedy: str = ""  # the thing that a person does at the robot
     assertive: bool = False  # screen readers interrupt for it
-    look: tuple[LookAt, ...] = ()  # what a person can say here to have looked at
+    look: tuple[LookAt, ...] = ()  # the losses that a person can say here to have looked at
 
 
 LOST = Banner(

@@ -36,7 +36,7 @@ def drawing_of(step: Step) -> str:
 
 
 def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
-    """Return the limits in words: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
+    """Return the limits as text: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
     if minimum is not None and minimum == maximum:
         return f"exactly {minimum:g} {unit}".rstrip()
     low = "" if minimum is None else f"at least {minimum:g}"
@@ -259,7 +259,7 @@ class RunFrame:
     attention: Attention
     banner: Banner
     tabs: tuple[Tab, ...]
-    coats: tuple[Coat, ...] = ()  # that disappear before a scan which is still to come
+    coats: tuple[Coat, ...] = ()  # coats that disappear before a scan which is still to come
 
 
 def run_frame(site: Site, run_id: str) -> RunFrame:

@@ -39,7 +39,7 @@ class Sphere:
     label: str  # "3"; "C1" for a control sphere
     kind: SphereKind  # "sphere": not known yet whether it is a registration or a control sphere
     centre_m: tuple[float, float, float]
-    rms_mm: float | None = None  # of the surface points against the fitted sphere
+    rms_mm: float | None = None  # rms distance of the surface points from the fitted sphere
     radius_residual_mm: float | None = None
 
 
@@ -151,8 +151,8 @@ class OutlineSource:
     source: str
     artefact: str
     spheres: tuple[Sphere, ...]
-    camera: CameraModel  # of the images in which the outlines were found
-    photograph: CameraModel  # of the photographs as captured, which may be larger
+    camera: CameraModel  # camera of the images in which the outlines were found
+    photograph: CameraModel  # camera of the photographs as captured, which may be larger
     T_camera_scan: Transform | None
     live: bool
 

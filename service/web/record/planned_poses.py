@@ -37,7 +37,7 @@ class StationPlan:
     """A station, as needed to draw a plan of it."""
 
     layout: StationLayout
-    specimen_m: tuple[float, float]  # along the approach, across it
+    specimen_m: tuple[float, float]  # size along the approach, and across it
 
 
 def station_of(log: RunRecord, name: str) -> StationPlan | None:

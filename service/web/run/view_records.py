@@ -49,7 +49,7 @@ class CaptureProgress:
     total: int
     percent: float
     left: str  # "about 12 min" or "measuring"
-    step_done: int  # in the current step
+    step_done: int  # images taken in the current step
     step_total: int
     step_left: str
 
@@ -204,7 +204,7 @@ class Viewer:
     """The person who looks, and how they stand to the control of this run."""
 
     may_operate: bool = False
-    may_sign: bool = False  # with or without control
+    may_sign: bool = False  # true with or without control
     role: str = ""
     loses_release: bool = False  # this person could release the run, and acting on it ends that
     may_take_over: bool = False
@@ -249,9 +249,9 @@ class JudgedStep:
 
     step: str
     title: str
-    seq: int  # of the event by which it passed
+    seq: int  # number of the event by which it passed
     figures: tuple[str, ...]
-    accepted: bool  # outside its limits
+    accepted: bool  # figures were accepted outside their limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,16 +274,16 @@ class StepView:
     checklist: tuple[ChecklistItem, ...]
     open_items: int
     gates: tuple[GateLine, ...]
-    warning: str  # of an irreversible step that has not been done
+    warning: str  # warning of an irreversible step that has not been done
     requires: tuple[tuple[str, bool], ...]
     captured: int
-    unused: int  # of them, board images without use
+    unused: int  # number of these that are board images without use
     planned: int
     signed_by: str
     skipped: bool
     started_utc: str
     ended_utc: str
-    table: Sequence[Row]  # of an evaluation
+    table: Sequence[Row]  # rows of an evaluation
     usual: str  # how long it usually takes; "" if that is not known, or it is done
     depends: tuple[AcceptedGate, ...]  # figures accepted outside their limits that this step depends on
 
@@ -308,7 +308,7 @@ class StepRedo:
     step: str
     title: str
     resets: tuple[str, ...]
-    images: int  # whose evidence stays, but which no longer count
+    images: int  # number of images whose evidence stays, but which no longer count
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,7 +317,7 @@ class SignedContent:
 
     sha256: str
     title: str
-    figures: tuple[tuple[str, tuple[str, ...]], ...]  # by step
+    figures: tuple[tuple[str, tuple[str, ...]], ...]  # figures by step
     meaning: str  # offered; the person may change it
 
 
@@ -325,7 +325,7 @@ class SignedContent:
 class Acceptance:
     """The figures outside their limits that can be accepted now, and who may accept them."""
 
-    sha256: str  # of the figures that the acceptance binds
+    sha256: str  # hash of the figures that the acceptance binds
     title: str
     figures: tuple[str, ...]
     role: str
@@ -362,7 +362,7 @@ class Choice:
     words: str
     takes: str
     loses: str
-    why_not: str  # "" where it can be taken
+    why_not: str  # "" if it can be taken
     button: str
 
 
@@ -420,7 +420,7 @@ class RunView:
     steps: tuple[StepLine, ...]
     passed: int
     shown: StepView
-    judged: tuple[JudgedStep, ...]  # since a person last decided something, the newest first
+    judged: tuple[JudgedStep, ...]  # steps judged since a person last decided something, the newest first
     question: Question
     viewer: Viewer
     progress: CaptureProgress
@@ -428,7 +428,7 @@ class RunView:
     working: tuple[str, int, int]
     takes: tuple[str, ...]  # how long the work usually takes, and until when nobody is needed
     work_left: str  # how long the rest of the run usually takes; "" if that is not known
-    tries: str  # what failed and is tried again by itself, in words; "" for nothing
+    tries: str  # a text on what failed and is tried again by itself; "" for nothing
     deviations: tuple[Deviation, ...]
     news: tuple[tuple[str, str], ...]
     to_come: tuple[str, ...]  # results that are still being computed, with the time left

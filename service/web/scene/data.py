@@ -312,8 +312,8 @@ class CameraRow:
     name: str
     station: str
     position_mm: Vector
-    tilt_deg: float  # of the optical axis from straight down
-    distance_mm: float  # from the middle of the spheres
+    tilt_deg: float  # tilt of the optical axis from straight down
+    distance_mm: float  # distance from the middle of the spheres
     planned: bool
 
 
@@ -335,7 +335,7 @@ class StationRow:
 
     name: str
     position_mm: Vector
-    distance_mm: float  # from the middle of the spheres
+    distance_mm: float  # distance from the middle of the spheres
     cameras: int
 
 

@@ -28,7 +28,7 @@ class DrawnRow:
     by: str
     source: str
     corners: int
-    used: bool  # by the fusion whose result the run has
+    used: bool  # used by the fusion whose result the run has
 
 
 def drawn_rows(log: RunRecord) -> tuple[DrawnRow, ...]:
