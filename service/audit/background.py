@@ -83,8 +83,8 @@ class ChildProcesses:
             run_id: the run.
             arguments: the arguments of the module's command line.
             by: the account of the person who asked for it.
-            keep: called with the result before it is shown; may raise OSError or ValueError.
-            tidy: called when the child has ended, however that was: one that is killed removes nothing itself.
+            keep: a function that is called with the result before it is shown; may raise OSError or ValueError.
+            tidy: a function that is called when the child has ended in any way; a killed one removes nothing itself.
         """
         with self._lock:
             now = self._states.get(run_id)

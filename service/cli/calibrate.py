@@ -79,7 +79,7 @@ class SuggestedBoardPose(JobRecord):
 
 
 class HandEyeFile(HandEye):
-    """A hand_eye.json.
+    """The content of a file hand_eye.json.
 
     Attributes:
         left_out: reason, by file of the folder that was not searched.

@@ -194,8 +194,8 @@ def export_folder(
     Args:
         target: a new folder in an existing one.
         identity: a text that identifies what is exported, and how.
-        leaving: called with the list of checksums when all is written, before the folder has its name.
-        told: called with the number of files that are there, after each of them.
+        leaving: a function called with the list of checksums when all is written, before the folder has its name.
+        told: a function that is called with the number of files that are there, after each of them.
 
     Raises:
         DataError: the target exists, its parent does not, or something else has the name of the unfinished folder.

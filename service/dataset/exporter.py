@@ -20,7 +20,7 @@ Progress = Callable[[str, int, int], None]  # activity, files done, files in tot
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A format.
+    """An export format.
 
     Attributes:
         name: the format's name on the command line.
@@ -71,8 +71,8 @@ def write_data_set(
         how: the format.
         target: a new folder; it appears when it is whole.
         personal: False leaves GPS, owner and serial numbers out of resampled pictures.
-        leaving: called with the list of checksums when all is written, before the folder has its name.
-        progress: called with the activity, the files done and their total.
+        leaving: a function called with the list of checksums when all is written, before the folder has its name.
+        progress: a function that is called with the activity, the files done and their total.
 
     Raises:
         DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.

@@ -31,7 +31,7 @@ class KnownFurtherCamera:
         calibration: file with its intrinsics.
         images: its photograph of each valid view, by viewpoint.
         located: its pose, as the registration step found it; None before that.
-        clock: how far its clock is ahead of the first camera's; None if the photographs do not show it.
+        clock: the offset of its clock from the first camera's; None if the photographs do not show it.
     """
 
     name: str

@@ -31,8 +31,8 @@ def make_preview(summary: RunSummary, folder: Path, progress: Progress) -> Previ
 
     Args:
         summary: the run.
-        folder: made if it is not there; what it holds is replaced.
-        progress: called with the activity, the amount done and the total.
+        folder: the preview's folder; it is made if it is not there, and its content is replaced.
+        progress: a function that is called with the activity, the amount done and the total.
 
     Raises:
         DataError: there is no data set yet, or a photograph cannot be read.
@@ -139,7 +139,7 @@ def small_pictures(
     Args:
         folder: the preview's folder.
         shown: the view, whose files are to be written.
-        view: the same in the data set.
+        view: the same view in the data set.
         pixels: the pixels of the data set.
         crops: the crops of the view.
 

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 LIST = "preview.json"
 FILE_NAME = re.compile(r"[a-z0-9_-]{1,60}\.(jpg|webp|json)")
-AT_LEAST = (1, 2, 4, 8)  # views, of which the coverage is told
+AT_LEAST = (1, 2, 4, 8)  # numbers of views for which the coverage is reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,13 +136,13 @@ class Preview:
     """A data set on the screen, as far as it is ready.
 
     Attributes:
-        views: all of them.
+        views: all views.
         crop: width and height of the crops, px.
-        coverage: None: not yet.
-        ground_truth: None: not yet, or the mesh is the scan's.
-        distances: None: not yet, or `no_distances` says why not.
-        no_distances: reason.
-        whole: nothing more will come.
+        coverage: the views' coverage of the surface; None: not yet.
+        ground_truth: the fused mesh; None: not yet, or the mesh is the scan's.
+        distances: the CT against the scan; None: not yet, or `no_distances` says why not.
+        no_distances: the reason.
+        whole: true when nothing more will come.
     """
 
     views: tuple[ViewPreview, ...]

@@ -46,7 +46,7 @@ class About:
         specimen: the specimen, as entered at the start of the run.
         purpose: the purpose, likewise.
         site: the site, likewise.
-        origin: how the photographs came into the run, a sentence.
+        origin: a sentence on how the photographs came into the run.
         published_utc: time of the last event that the data set rests on.
         head_sha256: hash of that event.
         software: version of this program.
@@ -58,7 +58,7 @@ class About:
         covariance: a sentence on what the covariances of the poses hold.
         mesh: a sentence on what the ground-truth mesh is.
         masks: a text on what the masks hold.
-        fusion: how CT and scan agree and were fused, (name, value) as text; empty if the mesh is the scan.
+        fusion: (name, value) texts on how CT and scan agree and were fused; empty if the mesh is the scan.
         gates: verdicts as text, by step.
         accepted: gates accepted outside their limits, as text.
         deviations: deviations from the protocol, as text.
@@ -167,7 +167,7 @@ SIMULATED = "SIMULATED: made by a simulated rig, not by a camera in front of a s
 
 @dataclass(frozen=True, slots=True)
 class PosedView:
-    """One image.
+    """An image of the data set with its camera and pose.
 
     Attributes:
         name: the view's unique name without suffix, of letters, digits, `_`, `-` and `.`.

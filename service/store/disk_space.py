@@ -142,9 +142,9 @@ class Leftover:
     Attributes:
         path: relative to the data folder.
         size_bytes: its size.
-        written_utc: when it was last written or stored again.
+        written_utc: the time when it was last written or stored again.
         kind: `part` is an interrupted write, `unrecorded` a complete file that was never recorded.
-        stays: why it must not be removed now; "" if it may be.
+        stays: the reason why it must not be removed now; "" if it may be.
     """
 
     path: str

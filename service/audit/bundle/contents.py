@@ -78,7 +78,7 @@ def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | 
     Args:
         target: the file.
         at: time stamp of its entries.
-        leaving: called with the complete file before it gets its name; if it raises, no file appears.
+        leaving: a function called with the complete file before it gets its name; if it raises, no file appears.
 
     Raises:
         DataError: a file of this name exists.

@@ -141,7 +141,7 @@ def export_bundle(
         actor: the person who exports.
         hashes_only: leave out the recorded files; their hashes are in the records.
         report: makes an HTML report to be included.
-        progress: called with the activity, the bytes done and the total.
+        progress: a function that is called with the activity, the bytes done and the total.
 
     Raises:
         IntegrityError: the evidence does not verify. Nothing was written.

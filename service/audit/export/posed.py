@@ -35,7 +35,7 @@ def export_data_set(
         wanted: format and options.
         target: the folder, which appears when it is whole. An interrupted export goes on.
         actor: the person who exports.
-        progress: called with the activity, the amount done and the total.
+        progress: a function that is called with the activity, the amount done and the total.
 
     Raises:
         ConfigurationError: there is no such format or crop, or another process writes this folder.

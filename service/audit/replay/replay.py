@@ -144,7 +144,7 @@ def replay(
         step: only this step's jobs.
         end_to_end: feed each job the recomputed results; the report then has the drift of each registration.
         out: folder to keep the recomputed files in, by step, job and name.
-        progress: called with the activity, the amount done and the total.
+        progress: a function that is called with the activity, the amount done and the total.
 
     Raises:
         IntegrityError: the evidence does not verify; the message names the first fault.

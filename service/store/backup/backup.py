@@ -53,8 +53,8 @@ class BackupOptions:
     """The options of a backup, besides copying what is new.
 
     Attributes:
-        with_keys: also copy the private signing key.
-        read_all: hash again every file that earlier backups copied, and copy altered ones again.
+        with_keys: true to copy the private signing key, too.
+        read_all: true to hash again every file that earlier backups copied, and to copy altered ones again.
         keep: number of newest states to keep; None keeps all. If this state has faults, none is discarded.
     """
 
@@ -81,7 +81,7 @@ def back_up(
         data_dir: the data folder, which a run may be using.
         destination: the folder of backups: new, empty, or with earlier backups of this data folder.
         options: the backup's options.
-        progress: called with the number of bytes copied.
+        progress: a function that is called with the number of bytes copied.
         files: durable file operations.
         clock: gives the state its name.
 

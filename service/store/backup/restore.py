@@ -63,7 +63,7 @@ def restore(
         name: the state to restore; "" for the newest.
         actor: gives the name of the person who restores, for the record, or raises if that is somebody else's; called
             with the folder once it has the accounts.
-        progress: called with the number of bytes copied, then verified.
+        progress: a function that is called with the number of bytes copied, then verified.
         files: durable file operations.
 
     Raises:

@@ -37,7 +37,7 @@ class RowImage:
 
 @dataclass(frozen=True, slots=True)
 class JournalLine:
-    """One line.
+    """One line of the journal.
 
     Attributes:
         number: the line's number from 1, as it says; 0 if it cannot be read.
@@ -47,8 +47,8 @@ class JournalLine:
         continued: true if the next line belongs to the same transaction.
         earlier_events: number of events that were recorded before there was a journal; only in its first line.
         sha256: hash of its bytes.
-        end: offset in the file after it.
-        problem: why it is not as it was written, as far as it shows by itself; "" if it does not.
+        end: the offset in the file after it.
+        problem: the reason why it is not as it was written, as far as it shows by itself; "" if it does not.
     """
 
     number: int

@@ -43,7 +43,7 @@ class RebuildReport:
         restored_events: number of these that the old database no longer held.
         kept: files of the data folder that hold what was there before.
         lost: texts on what could not be restored.
-        unsigned: why the record of this could not be signed; "" if it was.
+        unsigned: the reason why the record of this could not be signed; "" if it was.
     """
 
     made: Literal["", "database", "journal"]
@@ -60,9 +60,9 @@ class _Found:
     """A database as it was found.
 
     Attributes:
-        problem: why it cannot be relied upon; "" if SQLite reads all of it.
+        problem: the reason why it cannot be relied upon; "" if SQLite reads all of it.
         held: number of the journal's line that it holds.
-        events: how many events can be read.
+        events: number of events that can be read.
     """
 
     problem: str

@@ -49,8 +49,8 @@ class LogLine:
 
     Attributes:
         number: the line's number, from 1.
-        checkpoint: None if the line cannot be read.
-        problem: why the line cannot be read or does not follow the line before it; "" if it is valid.
+        checkpoint: the checkpoint in the line; None if the line cannot be read.
+        problem: the reason why the line cannot be read or does not follow the one before it; "" if it is valid.
         message: the bytes that are signed.
         key_id: fingerprint of the key that signed the line.
         signature: the signature in base64.

@@ -89,7 +89,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
 
     Args:
         store: the data folder.
-        reason: why, for the record.
+        reason: the reason of the person, for the record.
         actor: the person who replaces it.
         lost: the old private key is gone. The new one is recorded without its predecessor's signature, and every
             later verification says so.

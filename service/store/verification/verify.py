@@ -95,7 +95,7 @@ def verify(
     Args:
         data_dir: the data folder.
         run_id: one run, or None for all.
-        progress: called with the number of bytes hashed.
+        progress: a function that is called with the number of bytes hashed.
         certificates: PEM file of the time-stamp authorities. Without it, only the stamped content is checked.
         files: False skips the files; a note says so.
         signatures_copy: a copy of the log of signatures from elsewhere, which shows whether the log was cut.

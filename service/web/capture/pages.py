@@ -100,7 +100,7 @@ class StepImages:
         advice, suggestions: a text on what the images need, and the views that would help most.
         following: the page shows the newest image.
         query: the query of the page.
-        tail: the same as the query of an address, for the parts of the page.
+        tail: `query` as the query of an address, for the parts of the page.
         words, tones: labels and tones of the states of viewpoints.
         reasons: presets for a redo.
         csrf: token of the forms.

@@ -56,7 +56,7 @@ class RunLine:
 
 @dataclass(frozen=True, slots=True)
 class StartableProtocol:
-    """A protocol file."""
+    """A protocol file that can be started."""
 
     file: str
     loaded: LoadedProtocol | None

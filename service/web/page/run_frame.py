@@ -150,7 +150,7 @@ class RunStanding:
     Attributes:
         mode: the thing that it does or waits for.
         decision: the decision of what the machine would do next.
-        key: the same for a light tower, and for screens that show other runs.
+        key: the standing for a signal tower, and for screens that show other runs.
         word: the standing in one or two words.
         tone: the tone of that word.
         why: the thing that stops it or is asked for, without a full stop; "" for nothing.

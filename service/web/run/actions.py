@@ -78,7 +78,7 @@ class ActionForm(BaseModel):
         reason: text that is added to it.
         meaning: the meaning of a signature.
         known_by: the kind of secret in `password`: a password, or a PIN or badge where the site allows them to sign.
-        password: see `known_by`.
+        password: the secret of the person who acts; `known_by` says of which kind.
         account: the account of the person who accepts, where that is not the person who is signed in.
         signed_sha256: hash of the record that a signature or acceptance binds.
         seen_seq: number of the last event that the page showed.

@@ -81,7 +81,7 @@ def run_view(
         to_come: texts on what is still being computed.
         computing: the jobs that wait or are computed, which a person may end.
         space: forecast of what the run will still write; None if it is not known.
-        earlier: how long the steps took in earlier runs.
+        earlier: the times that the steps took in earlier runs.
         now_utc: the time of the page; "" where none is to be compared with it.
     """
     protocol, state = log.protocol, log.state

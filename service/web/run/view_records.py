@@ -376,11 +376,11 @@ class Question:
         can_pause: true if this person can pause the run.
         asked_anew: the program that drove the robot has ended, or the confirmation was too long ago, so nothing moves
             before somebody confirms again.
-        lapsed: why the confirmation no longer holds; "" where the program has ended.
+        lapsed: the reason why the confirmation no longer holds; "" where the program has ended.
         standing: the run is paused and the robot is known to stand still.
         paused: a text on how it stands with a paused run and its robot.
         more: the step's request in its normal course; None for nothing, or where something went wrong.
-        trouble: why the run is stopped; None if it is not.
+        trouble: the trouble for which the run is stopped; None if it is not.
         ways: the ways out of that, the recommended one first.
         signature: the content to be signed; None for nothing.
         acceptance: the figures that could be accepted outside their limits; None for nothing.
@@ -406,7 +406,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class RunView:
-    """The run page."""
+    """The data that the run page shows."""
 
     run_id: str
     title: str

@@ -307,7 +307,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class CameraRow:
-    """A camera pose; a planned one has not been taken yet."""
+    """A row of the table of camera poses; a planned one has not been taken yet."""
 
     name: str
     station: str
@@ -319,7 +319,7 @@ class CameraRow:
 
 @dataclass(frozen=True, slots=True)
 class SphereRow:
-    """A sphere."""
+    """A row of the table of spheres."""
 
     label: str
     kind: str
@@ -331,7 +331,7 @@ class SphereRow:
 
 @dataclass(frozen=True, slots=True)
 class StationRow:
-    """A robot base."""
+    """A row of the table of robot bases."""
 
     name: str
     position_mm: Vector
