@@ -74,7 +74,7 @@ class Snapshot(Record):
     pedal_armed: bool = False  # pressed once; a second press lets the robot move
 
     def age_s(self, now_utc_s: float) -> float:
-        """Return seconds since it was written, by now."""
+        """Return the seconds since it was written, by now."""
         return now_utc_s - self.at_utc_s
 
     def shown(self) -> tuple[object, ...]:
@@ -106,7 +106,7 @@ class Snapshot(Record):
         return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
 
     def unattended_s(self, now_utc_s: float) -> float:
-        """Return seconds since the main loop's last report, by now; infinity if the clock was set back since."""
+        """Return the seconds since the main loop's last report, by now; infinity if the clock was set back since."""
         return age_s(self.at_utc_s, now_utc_s, if_set_back_s=math.inf) + self.quiet_s
 
     @property

@@ -35,7 +35,7 @@ _AT_ONCE = 200  # rows
 
 
 def wait_after_s(failures: int) -> float:
-    """Return seconds to wait after this many wrong passwords in a row."""
+    """Return the seconds to wait after this many wrong passwords in a row."""
     over = failures - FREE_FAILURES
     return 0.0 if over < 0 else min(FIRST_WAIT_S * 2.0 ** min(over, 10), LONGEST_WAIT_S)
 
@@ -78,7 +78,7 @@ class KnownTries:
         return bool(origin.by) or origin == TERMINAL or (account, origin.address) in self._addresses
 
     def wait_s(self, account: str, origin: SecretOrigin) -> float:
-        """Return seconds to wait before the next try; 0 for none."""
+        """Return the seconds to wait before the next try; 0 for none."""
         return self._wait_s(_counted_at(account, origin))
 
     def longest_wait_s(self, account: str) -> float:

@@ -178,7 +178,7 @@ class SystemClock:
         return self.utc_now().timestamp()
 
     def monotonic_s(self) -> float:
-        """Return seconds of the host's monotonic clock."""
+        """Return the seconds of the host's monotonic clock."""
         return time.monotonic()
 
     def boot(self) -> str:

@@ -166,7 +166,7 @@ class Limiter:
         window_s: float = TRIES_WINDOW_S,
         addresses: int = 10_000,
     ) -> None:
-        """`failed_tries`: address and age in s of failed tries before the service started, oldest first."""
+        """Start with the `failed_tries` from before the service started: address and age in s, oldest first."""
         self._clock = clock
         self._tries = tries
         self._window_s = window_s

@@ -185,7 +185,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
             self.release()
 
     def close(self) -> None:
-        """Say how many were left out at all."""
+        """Say how many messages were left out in all."""
         self._tell(float("inf"))
         super().close()
 

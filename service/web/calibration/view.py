@@ -207,7 +207,7 @@ def image_rows(calibration: Calibration) -> list[ImageRow]:
 
 
 def held_out_mm(calibration: Calibration) -> tuple[float, float] | None:
-    """Return median and maximum error of the board's position, mm, by images that the hand-eye did not use."""
+    """Return the median and maximum error of the board's position, mm, by images that the hand-eye did not use."""
     if calibration.best is None:
         return None
     values = list(calibration.best.residuals.held_out_mm.values())

@@ -141,7 +141,7 @@ def reset(
 
 
 def utc_of(utc_s: float) -> str:
-    """Return seconds since 1970 as the record writes times."""
+    """Return the seconds since 1970 as the record writes times."""
     return utc_text(datetime.fromtimestamp(utc_s, UTC))
 
 

@@ -264,7 +264,7 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
 
 
 def predicted_error_mm(registered: DisplayedRegistration, points_m: Array) -> Array:
-    """Return 3D standard deviation (N,) of points (N, 3) of the scan, due to the registration with the images, mm."""
+    """Return the 3D standard deviation (N,) of points (N, 3) of the scan by the registration with images, mm."""
     placed = Alignment(np.array(registered.record.T_world_scan), np.array(registered.record.covariance)[:6, :6])
     return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)
 
