@@ -158,12 +158,12 @@ class _Listed(ExportFolder):
     """Counts what a writer would write, and writes nothing."""
 
     def written_by(self, name: str, write: Callable[[Path], object], part: Part | None = None) -> None:
-        """Only remember the name."""
+        """Remember the name, and write nothing."""
         del write
         self._named(name, part)
 
     def anew(self, name: str, make: Callable[[], bytes]) -> None:
-        """Only remember the name."""
+        """Remember the name, and write nothing."""
         self.file(name, make)
 
     @property

@@ -146,7 +146,7 @@ class Cropped:
         self._originals = _Last(whole.pixels.picture)
 
     def picture(self, view: PosedView) -> bytes:
-        """Cut out and encoded again, with the photograph's metadata."""
+        """Return the picture, cut out and encoded again, with the metadata of the photograph."""
         original = self._originals.of(self._crops[view.name][0])
         return _encoded(view, self.colours(view), original, self._personal)
 
@@ -169,7 +169,7 @@ class Cropped:
         return self._inner.valid(source)[crop.slices]
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Return that no pixel shows a marker: crops are chosen so."""
+        """Return which pixels (H, W) show a marker; none does, as crops are chosen so."""
         return self._inner.markers(view)
 
 

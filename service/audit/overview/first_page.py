@@ -186,7 +186,7 @@ def verified(verification: Verification | None, head_sha256: str) -> str:
 
 
 def matches(run: ListedRun, wanted: RunFilter) -> bool:
-    """Return whether a run matches the filter, leaving aside its search words, which `find_runs` compares.
+    """Return whether a run matches the filter, leaving aside its search words (see `find_runs`).
 
     A run whose digest is not known yet is not hidden.
     """

@@ -202,7 +202,7 @@ def _notes(surveyed: Survey, held: int) -> Iterator[str]:
 def _differences(
     connection: sqlite3.Connection, rows: Iterator[RowImage], wanted: set[str] | None
 ) -> Iterator[Fault]:
-    """Yield the rows that are missing from the database, differ in it, or are not in the journal."""
+    """Yield a fault for each row that is missing from the database, differs in it, or is not in the journal."""
     expected: dict[_Key, _Written] = {}
     for row in rows:
         if not _is_of(row, wanted):

@@ -95,7 +95,7 @@ class _RecordedAccounts:
 def people_faults(
     events: Iterable[tuple[Mapping[str, Any], str]], accounts: Rows, links: Rows, sessions: Rows
 ) -> Iterator[Fault]:
-    """Yield rows that do not agree with the site's chain. What older chains do not record is not a fault.
+    """Yield a fault for each row that differs from the site's chain; what older chains do not record is none.
 
     Args:
         events: (payload, time) of account_changed and sign_in_recorded, oldest first.

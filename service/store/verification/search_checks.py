@@ -29,7 +29,7 @@ _DAMAGED = "the index by which auditors search is damaged"
 
 
 def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Yield events whose words a search would not find, or would find in another event.
+    """Yield a fault for each event whose words a search would not find, or would find in another event.
 
     All work is done on copies in a private database; the evidence is not opened for writing.
     """

@@ -110,7 +110,7 @@ def _fault(item: Checkpoint, what: str) -> Fault:
 
 
 def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[Fault]:
-    """Yield ends of the run's chain, recorded in the site's chain at starts of the service, that are not there."""
+    """Yield a fault for each end of the run's chain that the site's chain recorded at a start and that is gone."""
     for start_seq, heads in site.heads_at_start:
         if run_id in heads:
             seq, sha256 = heads[run_id]
@@ -125,7 +125,7 @@ def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[F
 def stamp_faults(
     site: ChainFacts, signed: Mapping[str, Sequence[Checkpoint]], stamps: Mapping[str, Sequence[Timestamp]]
 ) -> Iterator[Fault]:
-    """Yield time stamps that differ from those recorded in the site's chain; `signed` and `stamps` are by run.
+    """Yield a fault for each time stamp unlike that recorded in the site's chain; `signed`, `stamps` are by run.
 
     Stamps of other runs, and stamps made before the site's chain recorded them, are not checked.
     """
@@ -148,7 +148,7 @@ def stamp_faults(
 
 
 def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:
-    """Yield runs recorded as signed in the site's chain that are now missing, cut or different."""
+    """Yield a fault for each run that the site's chain recorded as signed and that is missing, cut or different."""
     gone: set[str] = set()
     for at, payload in site.runs_signed:
         run_id, seq = str(payload["run"]), int(payload["seq"])
@@ -163,7 +163,7 @@ def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, eve
 
 
 def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[Fault]:
-    """Yield events that are always signed at once (step passed, run ended) but have no signature: it was removed.
+    """Yield a fault for each event that is signed at once (step passed, run ended) and whose signature was removed.
 
     The last event may still be waiting for its signature, even if a worker has reported since.
     """
