@@ -34,19 +34,19 @@ STOPPED = 128 + signal.SIGTERM  # exit status of a child that was stopped and ha
 class ChildState:
     """The state of the running child process, or the result of the last one."""
 
-    by: str  # who asked for it
+    by: str  # account of the person who asked for it
     since_utc: str
     what: str = "starting"
     done: int = 0
     total: int = 0
     problem: str = ""  # why there is no result
     remedy: str = ""
-    stopped: bool = False  # by a person
+    stopped: bool = False  # true if a person stopped it
     result: Any = None  # plain data, once there is one
 
     @property
     def pending(self) -> bool:
-        """Whether it is still running."""
+        """True while the child is still running."""
         return not self.problem and self.result is None
 
 
@@ -54,7 +54,7 @@ class ChildProcesses:
     """Runs one module in child processes, at most one at a time for each run."""
 
     def __init__(self, module: str, name: str, clock: Clock) -> None:
-        """Args: `name`: what the module makes, for messages, such as "export"."""
+        """Run `module`; `name` says in messages what it makes, such as "export"."""
         self._module = module
         self._name = name
         self._clock = clock
@@ -64,7 +64,7 @@ class ChildProcesses:
         self._lock = Lock()
 
     def state(self, run_id: str) -> ChildState | None:
-        """The state of the running child, or of the last one; None before the first."""
+        """Return the state of the running child, or of the last one; None before the first."""
         with self._lock:
             return self._states.get(run_id)
 
@@ -81,10 +81,10 @@ class ChildProcesses:
 
         Args:
             run_id: the run.
-            arguments: of the module's command line.
-            by: who asked for it.
-            keep: called with the result before it is shown; may raise OSError or ValueError.
-            tidy: called when the child has ended, however that was: one that is killed removes nothing itself.
+            arguments: the arguments of the module's command line.
+            by: the account of the person who asked for it.
+            keep: a function that is called with the result before it is shown; may raise OSError or ValueError.
+            tidy: a function that is called when the child has ended in any way; a killed one removes nothing itself.
         """
         with self._lock:
             now = self._states.get(run_id)
@@ -165,7 +165,7 @@ class ChildProcesses:
 
 
 def ends_tidily_when_stopped() -> None:
-    """In a child process, turn SIGTERM into an exception, so that unfinished files are removed on the way out."""
+    """Turn SIGTERM into an exception in a child process, so that unfinished files are removed on the way out."""
     signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit(STOPPED))
 
 
@@ -216,7 +216,7 @@ class CopyableResult(Protocol):
     """A value that can be computed step by step."""
 
     def copy(self) -> Self:
-        """A copy that can be continued while pages read this one."""
+        """Return a copy that can be continued while pages read this one."""
         ...
 
 
@@ -229,8 +229,8 @@ class PartialResult(Generic[T]):
 
     value: T
     seq: int  # the last event that it covers
-    last: int  # of the run
-    sha256: str  # of that event
+    last: int  # number of the run's last event
+    sha256: str  # hash of that event
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +265,10 @@ class IncrementalResults(Generic[T]):
         self._warm = False
 
     def get(self, run_id: str, wait_s: float = WAIT_S) -> T | PartialProgress:
-        """The value for the present events of a run, or its progress. Raises UnknownRunError, errors of `advance`."""
+        """Return the value for the present events of a run, or its progress.
+
+        Raises UnknownRunError, errors of `advance`.
+        """
         ready = self.ready(run_id)
         if not isinstance(ready, PartialProgress):
             return ready
@@ -277,13 +280,13 @@ class IncrementalResults(Generic[T]):
         return self.ready(run_id)
 
     def ready(self, run_id: str) -> T | PartialProgress:
-        """The value if it is up to date, else None; nothing is computed. Raises UnknownRunError."""
+        """Return the value if it is up to date, else None; nothing is computed. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
             last, sha256 = head(connection, run_id)
         return self.at(run_id, last, sha256)
 
     def at(self, run_id: str, last: int, sha256: str) -> T | PartialProgress:
-        """`ready` for a known end of the chain."""
+        """Do as `ready` for a known end of the chain."""
         entry = self._entry(run_id)
         step = entry.step
         if step is None:

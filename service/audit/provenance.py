@@ -35,12 +35,12 @@ class Node:
     key: str
     is_job: bool
     step: str
-    kind: str  # of the files, or of the jobs
+    kind: str  # kind of the files, or of the jobs
     count: int
     first_seq: int
     failed: int = 0  # jobs that failed
     device: str = ""
-    seqs: tuple[int, ...] = ()  # of the first few events
+    seqs: tuple[int, ...] = ()  # numbers of the first few events
 
 
 @dataclass
@@ -60,25 +60,25 @@ class Graph:
     originals: dict[tuple[str, int, str], str] = field(default_factory=dict[tuple[str, int, str], str])
 
     def copy(self) -> Graph:
-        """A copy that can be continued while pages read this one."""
+        """Return a copy that can be continued while pages read this one."""
         names = ("nodes", "edges", "groups", "jobs", "numbers", "originals")
         return replace(self, by_value=set(self.by_value), **{name: dict(getattr(self, name)) for name in names})
 
     def ordered(self) -> list[Node]:
-        """The nodes in the order of their first events."""
+        """Return the nodes in the order of their first events."""
         return sorted(self.nodes.values(), key=lambda node: (node.first_seq, not node.is_job, node.key))
 
     def sources(self, key: str) -> list[tuple[Node, int]]:
-        """The nodes that feed a node, each with its number of files."""
+        """Return the nodes that feed a node, each with its number of files."""
         return [(self.nodes[a], n) for (a, b), n in self.edges.items() if b == key]
 
     def results(self, key: str) -> list[tuple[Node, int]]:
-        """The nodes that a node feeds, each with its number of files."""
+        """Return the nodes that a node feeds, each with its number of files."""
         return [(self.nodes[b], n) for (a, b), n in self.edges.items() if a == key]
 
 
 def graphs(store: Store) -> IncrementalResults[Graph]:
-    """Graphs of a data folder's runs, kept up to date in the background."""
+    """Return graphs of a data folder's runs, updated in the background."""
     return IncrementalResults(store, lambda run_id, before: _step(store, run_id, before), "provenance")
 
 
@@ -161,7 +161,7 @@ def _add_job(graph: Graph, row: Any) -> None:
 
 
 def _referred_to(graph: Graph, arguments: Any, key: str) -> set[str]:
-    """The nodes of jobs whose results the arguments refer to. Files that they refer to are added as edges."""
+    """Return the nodes of jobs whose results the arguments refer to. Files that they refer to are added as edges."""
     results: set[str] = set()
     for reference in references_in(arguments):
         if isinstance(reference, Reference):
@@ -195,10 +195,10 @@ def _connect(graph: Graph, source: str, target: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a file came from and what was made from it."""
+    """The origin of a file, and what was made from it."""
 
     records: Sequence[ArtefactRow]  # the first says where it came from
-    event: EventRow  # that brought it
+    event: EventRow  # the event that brought it
     job: EventRow | None  # job_enqueued event of the computation that made it
     inputs: Sequence[ArtefactRow]  # the files that it was computed or decoded from
     input_count: int
@@ -211,7 +211,7 @@ LISTED = 50
 
 
 def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
-    """What a file came from and what was made from it. Raises UnknownRunError if the run has no such file."""
+    """Find what a file came from and what was made from it. Raises UnknownRunError if the run has no such file."""
     records = one_artefact(connection, run_id, sha256)
     (event,) = read_rows(connection, run_id, [records[0].seq], whole=True)
     job = _job_of(connection, run_id, event)
@@ -232,7 +232,7 @@ def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
 
 
 def _naming(connection: Connection, run_id: str, word: str, limit: int = LISTED) -> list[int]:
-    """The events whose payload has this word."""
+    """Return the events whose payload has this word."""
     found = connection.execute(
         text(
             "SELECT i.seq FROM event_words AS w JOIN event_index AS i ON i.position = w.rowid "
@@ -272,7 +272,7 @@ def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Ar
 
 
 def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]:
-    """The files of the many earlier jobs that a job refers to at once."""
+    """Yield the files of the many earlier jobs that a job refers to at once."""
     enqueued = job.record(JobEnqueued)
     for each in references_in({} if enqueued is None else enqueued.arguments):
         if isinstance(each, Each) and each.field.startswith("artefacts/"):
@@ -291,7 +291,7 @@ def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]
 def _decoded_from(
     connection: Connection, run_id: str, event: EventRow, row: ArtefactRow
 ) -> tuple[list[ArtefactRow], int]:
-    """The originals of a file that a driver decoded: those kept before it in the same step from the same device."""
+    """Find the originals of a file that a driver decoded: those stored before it in the same step from its device."""
     kept = event.record(FilesKept)
     if kept is None or kept.note.startswith(_KEPT_AS_IT_CAME):
         return [], 0
@@ -384,7 +384,10 @@ def draw(graph: Graph) -> GraphDrawing:
 
 
 def _columns(shown: Sequence[Node], edges: Sequence[Edge]) -> dict[str, int]:
-    """The column of each node: after all of its sources. Nodes without a source stand just before their first use."""
+    """Return the column of each node: after all of its sources.
+
+    Nodes without a source stand just before their first use.
+    """
     place = {node.key: index for index, node in enumerate(shown)}
     # A group may feed itself (registrations from registrations): such an edge is drawn but does not count here.
     ranking = sorted(((a, b) for a, b in edges if place[a] < place[b]), key=lambda edge: place[edge[0]])
@@ -401,7 +404,10 @@ def _columns(shown: Sequence[Node], edges: Sequence[Edge]) -> dict[str, int]:
 
 
 def _rows(columns: Mapping[int, list[str]], edges: Sequence[Edge], place: Mapping[str, int]) -> dict[str, int]:
-    """The row of each node in its column, near the mean row of its sources, in a few sweeps. Sorts `columns`."""
+    """Return the row of each node in its column, near the mean row of its sources, in a few sweeps.
+
+    Sorts `columns`.
+    """
     row = {key: index for keys in columns.values() for index, key in enumerate(keys)}
     for _ in range(_SWEEPS):
         for number in sorted(columns):

@@ -101,7 +101,7 @@ def act_command(
 def _identity(
     store: Store, protocol: Protocol, state: RunState, verb: str, name: str, password: Callable[[], str]
 ) -> Identity:
-    """Who acts. Pausing is always safe, so anybody may pause without a password."""
+    """Identify the person who acts. Pausing is always safe, so anybody may pause without a password."""
     identity = identity_for(People(store), protocol, state, verb, name, password)
     if identity is None and verb == "pause":
         return who_pauses(People(store), name)
@@ -155,7 +155,7 @@ def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, jso
 
 
 def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
-    """SHA-256 of the event that an action binds; "" if the action is not a signature."""
+    """Return the SHA-256 of the event that an action binds; "" if the action is not a signature."""
     if verb == "accept":
         return state.step.gates_sha256
     return record_to_sign(protocol, state) if verb == "sign" else ""
@@ -241,7 +241,7 @@ def cancel_command(
 
 
 def _open_job(store: Store, run_id: str, name: str) -> Job:
-    """The job that a name or its first characters mean. Raises ConfigurationError."""
+    """Return the job that a name or its first characters mean. Raises ConfigurationError."""
     found = [job for job in store.jobs(run_id) if job.state in ("queued", "running") and job.job_id.startswith(name)]
     if len(found) != 1:
         what = f"{len(found)} computations of the run begin with" if found else "no computation of the run is called"

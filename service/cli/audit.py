@@ -309,7 +309,7 @@ def _key_json(key: PublicKey) -> dict[str, Any]:
 
 
 def report_json(report: AuditReport) -> dict[str, Any]:
-    """A verification report as plain data, with `ok` and `first_fault` added."""
+    """Return a verification report as plain data, with `ok` and `first_fault` added."""
     first = None if report.first_fault is None else {**asdict(report.first_fault), "text": str(report.first_fault)}
     return {"ok": report.ok, "first_fault": first, **asdict(report)}
 

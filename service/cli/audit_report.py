@@ -100,7 +100,10 @@ def report_command(
 
 
 def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
-    """The name of the person for whom the report is recorded. Raises ConfigurationError, SignInRefusedError."""
+    """Return the name of the person for whom the report is recorded.
+
+    Raises ConfigurationError, SignInRefusedError.
+    """
     with Store.open(data, create=False) as store:
         return acting_person(store, operator, password_stdin=password_stdin).name
 
@@ -128,7 +131,7 @@ def _record(data: Path, run_id: str, head_sha256: str, actor: str, part: Path, f
 
 
 def _writable(data: Path) -> bool:
-    """Whether anything can be recorded; an auditor's copy may be on a read-only medium."""
+    """Return whether anything can be recorded; an auditor's copy may be on a read-only medium."""
     return os.access(data, os.W_OK) and os.access(database_path(data), os.W_OK)
 
 

@@ -79,13 +79,13 @@ class SuggestedBoardPose(JobRecord):
 
 
 class HandEyeFile(HandEye):
-    """A hand_eye.json.
+    """The content of a file hand_eye.json.
 
     Attributes:
         left_out: reason, by file of the folder that was not searched.
         images_without_board: reason, by image in which the board was not found.
         suggested_poses: further poses, the most useful first.
-        suggestions_reachable: whether it was checked that the arm reaches them.
+        suggestions_reachable: true if it was checked that the arm reaches them.
     """
 
     left_out: dict[str, str]
@@ -99,14 +99,14 @@ class HandEyeFile(HandEye):
         return {**self.left_out, **self.excluded, **self.images_without_board}
 
     def text(self) -> str:
-        """The file's text. For a camera beside the robot it has T_base_camera and T_flange_board.
+        """Return the file's text. For a camera beside the robot it has T_base_camera and T_flange_board.
 
         So nothing that expects T_flange_camera can read such a file by mistake.
         """
         return json.dumps(self.printed(), indent=1, allow_nan=False) + "\n"
 
     def printed(self) -> Any:
-        """The content of the file as plain data, as `--json` prints it."""
+        """Return the content of the file as plain data, as `--json` prints it."""
         record = self.plain()
         return record if self.setup == "eye-in-hand" else _renamed(record)
 
@@ -235,7 +235,7 @@ class _RobotPoses:
     rows: Mapping[str, int] = field(default_factory=dict[str, int])
 
     def as_read(self, images: Sequence[str]) -> PosesAsRead | None:
-        """The file as a check against the images needs it: all its rows, and how else it could be read."""
+        """Return the file as a check against the images needs it: all its rows, and how else it could be read."""
         if self.table is None:
             return None
         rows, every = np.array([self.rows[image] for image in images]), self.table.poses()
@@ -255,7 +255,7 @@ def _robot_poses(
     *,
     strict: bool,
 ) -> tuple[_RobotPoses, ImageFolder]:
-    """The robot's poses, and the images that have one."""
+    """Return the robot's poses, and the images that have one."""
     if path.is_dir() or path.suffix.lower() == ".json" or not path.is_file():
         if rotation is not None or length is not None:
             raise typer.BadParameter("--rotation and --length are for tables of poses")
@@ -290,7 +290,7 @@ def _session(
 
 
 def _with_bow(board: Board, camera: Path) -> Board:
-    """The board as bent as the calibration of the camera has found it, if camera.json says so."""
+    """Return the board as bent as the calibration of the camera has found it, if camera.json says so."""
     record = parse_json(file_text(camera), name=str(camera), remedy="Give a camera.json")
     seen = record.get("board")
     return seen_board(board, BoardSeen.model_validate(seen) if isinstance(seen, dict) and "bow_mm" in seen else None)
@@ -307,7 +307,7 @@ def _require_possible(setup: Setup, joints: Path | None, arm: str | None, previe
 
 
 class _Reachable:
-    """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
+    """A check whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
     def __init__(self, arm: ArmModel, joints_rad: Array, session: _BoardSession) -> None:
         self._arm, self._joints, self._poses = arm, joints_rad, session.T_base_flange
@@ -320,7 +320,7 @@ class _Reachable:
 
 
 def _arm(joints: Path | None, arm: str | None, session: _BoardSession) -> tuple[Array | None, ArmModel | None]:
-    """The joints of each image, and the arm's model; None where no joints are given."""
+    """Return the joints of each image, and the arm's model; None where no joints are given."""
     if joints is None:
         if arm is not None:
             raise typer.BadParameter("--arm needs --joints")

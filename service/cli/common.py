@@ -92,12 +92,12 @@ def print_document(text: str) -> None:
 
 
 def exit_status(error: OrthocaptureError) -> int:
-    """With which status a command ends that met this error."""
+    """Return the exit status of a command that ends with this error."""
     return WAITS_FOR_A_PERSON if isinstance(error, PersonNeededError) else 1
 
 
 def error_record(error: OrthocaptureError) -> dict[str, str]:
-    """An error as plain data, for JSON output."""
+    """Return an error as plain data, for JSON output."""
     return {"kind": type(error).__name__, "what": error.what, "where": error.where, "remedy": error.remedy}
 
 
@@ -119,7 +119,7 @@ def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
 def reporting_errors(json: bool = False) -> Generator[None]:
     """Wrap a command's body: an OrthocaptureError is printed and ends it with its status; others are bugs and pass.
 
-    With `json` a bug is printed as JSON too, so that the program that reads it is told.
+    With `json` a bug is printed as JSON too, so that the program that reads it learns of it.
     """
     try:
         yield
@@ -135,7 +135,7 @@ def reporting_errors(json: bool = False) -> Generator[None]:
 
 
 def _bug_record(error: Exception) -> dict[str, str | list[str]]:
-    """A fault of this program as plain data, with what a developer needs to find it."""
+    """Return a fault of this program as plain data, with what a developer needs to find it."""
     frames = traceback.extract_tb(error.__traceback__)
     return {
         "kind": type(error).__name__,
@@ -227,7 +227,7 @@ def _unwritable(path: Path, error: OSError) -> ConfigurationError:
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr, shown after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
+    """Show a progress bar on stderr after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
     started = time.monotonic()
     bar = bar_of_shares(error_console)
     task = bar.add_task("", total=None)
@@ -252,12 +252,12 @@ PROTOCOL_HELP = "The protocol file, or the name of a shipped one, such as exvivo
 
 
 def shipped_protocols() -> Path:
-    """The folder of the protocols that come with orthocapture."""
+    """Return the folder of the protocols that come with orthocapture."""
     return Path(str(files(_FOLDER)))
 
 
 def protocol_file(named: Path) -> Path:
-    """The protocol file of this path, or the shipped one of this name if there is no such file.
+    """Return the protocol file of this path, or the shipped one of this name if there is no such file.
 
     `exvivo_spine`, `exvivo_spine.yaml` and `protocols/exvivo_spine.yaml` name the same one, wherever the command is
     given. Raises ProtocolError, which lists the names, if there is neither.

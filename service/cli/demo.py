@@ -142,7 +142,7 @@ def _evaluated(
 
 
 def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
-    """True registration error in mm at the scene's centre for each source of poses, from the simulator's own record.
+    """Return the true registration error, mm, at the scene's centre by source of poses, from the simulator's record.
 
     Only the demo and tests use it, after the run.
     """
@@ -156,7 +156,7 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
 
 
 def true_cameras(summary: RunSummary, exposures_log: Path) -> dict[str, Array]:
-    """The true T_world_camera (4, 4) of each capture's first file, by viewpoint, from the simulated camera's log."""
+    """Return the true T_world_camera (4, 4) of each capture's first file, by viewpoint, from the camera's log."""
     exposures = [json_module.loads(line) for line in exposures_log.read_text().splitlines() if line.strip()]
     by_sha256 = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
     return {
@@ -172,7 +172,7 @@ def true_error_mm(
     T_world_scan: ArrayLike,
     spheres_m: ArrayLike,
 ) -> float:
-    """The true registration error in mm at the centre of the spheres.
+    """Return the true registration error in mm at the centre of the spheres.
 
     Args:
         T_scan_camera: the registration, by viewpoint.
@@ -187,7 +187,7 @@ def true_error_mm(
 
 
 def free_address() -> str:
-    """The first loopback address at which a simulated arm's ports are free; clients of the arm use fixed ports.
+    """Return the first loopback address where a simulated arm's ports are free; the arm's clients use fixed ports.
 
     Raises:
         ConfigurationError: they are free at no address.
@@ -258,7 +258,7 @@ def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> _S
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """What the demonstration made, and how long it took."""
+    """The results of the demonstration, and how long it took."""
 
     run: str
     data_dir: str
@@ -267,13 +267,13 @@ class _Result:
     dataset: str
     report: str
     audit_ok: bool
-    dataset_files: int  # of which each has the hash that is listed
+    dataset_files: int  # number of files, each of which has the hash that is listed
     chamfer_mm: float  # CT and scan, both ways
     ct_to_scan_mm: float
     scan_to_ct_mm: float
     ct_to_scan_median_mm: float  # the means hold what only one of them shows
     scan_to_ct_median_mm: float
-    chamfer_floor_mm: float  # what equal surfaces would give
+    chamfer_floor_mm: float  # distance that equal surfaces would have
     duration_s: float
     table_note: str
 

@@ -46,7 +46,7 @@ def develop_command(
 
 
 def _require_new(files: list[Path], out: Path) -> None:
-    """Nothing is overwritten, and every raw file has a name of its own."""
+    """Require that nothing is overwritten, and that every raw file has a name of its own."""
     require_writable_folder(out)
     stems = [file.stem for file in files]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
@@ -58,7 +58,7 @@ def _require_new(files: list[Path], out: Path) -> None:
 
 
 def _jpeg_of(raw: Path) -> Path | None:
-    """The JPEG of the same name, if there is one."""
+    """Return the JPEG of the same name, if there is one."""
     if not raw.is_file():
         raise DataError("the file does not exist", where=str(raw), remedy="Check the path")
     beside = (path for path in raw.parent.iterdir() if path.stem == raw.stem and path.suffix.lower() in _JPEGS)

@@ -136,7 +136,7 @@ def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | Ortho
 
 
 def _second_place(rig: Rig, data: Path) -> dict[str, str]:
-    """The path of the second place of the signatures and what is wrong with it; nothing if the rig names none.
+    """Return the path of the second place of the signatures and what is wrong with it; nothing if the rig names none.
 
     What is missing there is written.
     """
@@ -195,7 +195,7 @@ def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
 
 
 def _identity_words(who: DeviceIdentity) -> str:
-    """Model, serial number and firmware, as far as the device states them."""
+    """Return model, serial number and firmware, as far as the device states them."""
     return ", ".join(part for part in (who.model, f"serial {who.serial}" if who.serial else "", who.firmware) if part)
 
 

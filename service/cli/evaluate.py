@@ -73,7 +73,7 @@ def chamfer_command(
 
 
 def score_record(score: ChamferScore) -> dict[str, Any]:
-    """The score as plain data; `pred_to_gt` and `gt_to_pred` hold what belongs to one direction."""
+    """Return the score as plain data; `pred_to_gt` and `gt_to_pred` hold what belongs to one direction."""
     names = [f"{mm(limit):.1f}" if mm(limit) >= 0.1 else f"{mm(limit):g}" for limit in score.thresholds_m]
     return {
         "chamfer_mm": mm(score.chamfer_m),

@@ -130,7 +130,10 @@ def export_command(
 
 
 def _stated(**fields: Any) -> DataSetStatement:
-    """The statement of the options. Raises ConfigurationError if one is too long, empty or a wrong identifier."""
+    """Return the statement of the options.
+
+    Raises ConfigurationError if one is too long, empty or a wrong identifier.
+    """
     try:
         stated = DataSetStatement(**fields)
     except ValidationError as error:

@@ -120,7 +120,7 @@ def _fused(common: CommonPart, scan: Surface, aligned: Aligned, blend_m: float) 
 
 
 def fusion_record(aligned: Aligned, score: ChamferScore, fused: Fused) -> dict[str, Any]:
-    """What was measured, as plain data in millimetres."""
+    """Return what was measured as plain data in millimetres."""
     return {
         "spheres": len(aligned.loop.spheres),
         "spheres_moved": len(aligned.loop.moved),

@@ -156,7 +156,7 @@ def import_command(
 
 
 def _parts_of(protocol: Protocol) -> set[PhotographRole | FileRole]:
-    """What the steps of a protocol import."""
+    """Return which photographs and files the steps of a protocol import."""
     parts: set[PhotographRole | FileRole] = set()
     for step in protocol.step_ids:
         part = part_of(protocol, step)
@@ -178,7 +178,7 @@ def _require_wanted(protocol: Protocol, listing: ImportList) -> None:
 
 
 def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, again: bool, about: RunAbout) -> str:
-    """The unfinished run of exactly this list and protocol, or a new run.
+    """Return the unfinished run of exactly this list and protocol, or a new run.
 
     Raises ConfigurationError if the list was imported before, or if files of a simulated run are imported as real.
     """
@@ -210,7 +210,7 @@ def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, ag
 
 
 def listing_record(listing: ImportList) -> dict[str, object]:
-    """The import list as plain data, for JSON output."""
+    """Return the import list as plain data, for JSON output."""
     return {
         "folder": listing.folder,
         "photographs": {role: asdict(_photographs(listing, role)) for role in _PARTS if listing.holds(role)},
@@ -221,13 +221,13 @@ def listing_record(listing: ImportList) -> dict[str, object]:
 
 
 def _unread(listing: ImportList) -> dict[str, str]:
-    """What could not be read of photographs that are imported all the same, by file."""
+    """Return by file what could not be read of photographs that are imported all the same."""
     return {v.photograph.path: str(v.camera["unread"]) for v in listing.views if "unread" in v.camera}
 
 
 @dataclass(frozen=True, slots=True)
 class _PhotographsOfRole:
-    """Counts, cameras, lenses, dates (EXIF; "" if not stated) and sizes of the photographs with one role."""
+    """Counts, cameras, lenses, dates (EXIF; "" if missing) and sizes of the photographs with one role."""
 
     count: int
     raw_files: int
@@ -292,7 +292,7 @@ def _show(listing: ImportList) -> None:
 
 
 def _dates(first: str, last: str) -> str:
-    """The span between two EXIF times (`2024:03:01 10:14:00.000+00:00`), to the minute."""
+    """Return the span between two EXIF times (`2024:03:01 10:14:00.000+00:00`), to the minute."""
     if not first:
         return "not stated"
     begin, end = (f"{text[:10].replace(':', '-')} {text[11:16]}" for text in (first, last))

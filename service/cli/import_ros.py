@@ -141,7 +141,7 @@ def _write_record(path: Path, record: Mapping[str, object]) -> None:
 
 @contextmanager
 def _new_folder(out: Path) -> Generator[Path]:
-    """A folder beside `out` that gets its name when the block ends without an error, and is removed otherwise.
+    """Yield a folder beside `out` that gets its name when the block ends without an error, and is removed otherwise.
 
     Raises DataError if `out` exists, or cannot be made.
     """
@@ -192,7 +192,7 @@ def _image_topic(found: Recording, wanted: str, file: Path) -> str:
 
 
 def _of_topic(found: Recording, topic: str, base: str, file: Path) -> FrameTree:
-    """The poses of a topic as a tree of two frames."""
+    """Return the poses of a topic as a tree of two frames."""
     if topic not in found.poses:
         raise DataError(
             f"there is no topic {topic} of poses; there is {', '.join(sorted(found.poses)) or 'none'}",
@@ -215,7 +215,7 @@ def _of_topic(found: Recording, topic: str, base: str, file: Path) -> FrameTree:
 def _poses(
     tree: FrameTree, base: str, flange: str, stamps_ns: dict[str, int], timing: Timing
 ) -> tuple[dict[str, FoundPose], dict[str, str]]:
-    """T_base_flange of every image that has one, and why the others have none."""
+    """Return T_base_flange of every image that has one, and why the others have none."""
     poses: dict[str, FoundPose] = {}
     left_out: dict[str, str] = {}
     for name, stamp_ns in sorted(stamps_ns.items()):
@@ -254,7 +254,7 @@ def _mount(tree: FrameTree, flange: str, camera_frame: str) -> Transform:
 
 
 def _how_found(taken: _Images, poses: dict[str, FoundPose]) -> dict[str, dict[str, int | bool]]:
-    """Of each image with a pose its stamp, and how the pose was found."""
+    """Return the stamp of each image with a pose, in ns, and how the pose was found."""
     return {
         name: {"stamp_ns": taken.stamps_ns[name], "away_ns": one.away_ns, "interpolated": one.interpolated}
         for name, one in poses.items()
@@ -271,7 +271,7 @@ def _nothing(left_out: dict[str, str], file: Path) -> DataError:
 
 
 def _words(poses: dict[str, FoundPose]) -> str:
-    """How the poses were found."""
+    """Return how the poses were found."""
     between = [one for one in poses.values() if one.interpolated]
     near = [one for one in poses.values() if one.away_ns and not one.interpolated]
     text = f"{counted(len(poses), 'image')} with a pose: {len(poses) - len(between) - len(near)} of the same time"

@@ -98,7 +98,7 @@ def described_board(
     size_tolerance_percent: float = DEFAULT_SIZE_TOLERANCE_PERCENT,
     flatness_mm: float = DEFAULT_FLATNESS_MM,
 ) -> Board:
-    """The board that the options describe.
+    """Return the board that the options describe.
 
     Raises:
         typer.BadParameter: the counts are not COLSxROWS.
@@ -124,7 +124,7 @@ def described_board(
 
 
 def searched(files: Sequence[Path], board: Board, *, quiet: bool) -> UsableViews:
-    """The views of a board that can be used, of images searched under a progress bar.
+    """Return the views of a board that can be used, of images searched under a progress bar.
 
     Raises:
         ComputeError: a sample of the images shows a board other than the one described, or no view can be used.
@@ -213,13 +213,13 @@ def intrinsics_command(
 
 
 def _with_reasons(error: ComputeError, views: UsableViews, files: Sequence[Path]) -> ComputeError:
-    """The error with the first images that were excluded before the estimation, and why."""
+    """Return the error with the first images that were excluded before the estimation, and why."""
     reasons = "".join(f"; {files[k].name}: {reason}" for k, reason in sorted(views.excluded.items())[:5])
     return ComputeError(error.what + reasons, where=error.where, remedy=error.remedy)
 
 
 def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[dict[str, Any], list[str]]:
-    """Changes of the optics between the images, as a record and as warnings."""
+    """Return changes of the optics between the images, as a record and as warnings."""
     calibrated = [optics_of(file) for file in calibration]
     within = compare_optics(calibrated, calibrated)
     record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
@@ -242,7 +242,7 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
 
 
 def optics_of(file: Path) -> Optics:
-    """The optics stated in a file's EXIF.
+    """Return the optics in a file's EXIF.
 
     Raises:
         DataError: the file is not an image.

@@ -99,7 +99,7 @@ def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
 
 
 def _moves(centres: Array, radius_m: float) -> tuple[Move, ...]:
-    """Suggested moves; empty if no single move helps, which the report's problems also say."""
+    """Return suggested moves; empty if no single move helps, which the report's problems also say."""
     _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
     try:
         return suggest_moves(centres, up=axes[2], radius_m=radius_m)

@@ -23,7 +23,7 @@ from service.logs.terminal import show_own_words_only
 
 @dataclass(frozen=True, slots=True)
 class _Command:
-    """Where a command is, and its line in the list of commands: the first paragraph of its own help."""
+    """The place of a command, and its line in the list of commands: the first paragraph of its own help."""
 
     place: str
     line: str
@@ -180,7 +180,7 @@ class _Commands(TyperGroup):
     """The group of all commands, each imported on first use."""
 
     def make_context(self, *words: Any, **options: Any) -> Any:
-        """The options before the command."""
+        """Return the options before the command."""
         with _usage_escaped():
             return super().make_context(*words, **options)
 
@@ -190,11 +190,11 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names in the order of the help text."""
+        """Return names in the order of the help text."""
         return list(_GROUP_OF)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The name and the line of a command, for help and shell completion; None if there is no such command.
+        """Return the name and the line of a command, for help and shell completion; None if there is no such command.
 
         Importing every command would take seconds. The one that was typed comes from `resolve_command`.
         """
@@ -203,7 +203,7 @@ class _Commands(TyperGroup):
         return TyperCommand(cmd_name, help=_COMMANDS[cmd_name].line, rich_help_panel=_GROUP_OF[cmd_name])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that was typed, imported; suggests a similar name if there is no such command."""
+        """Return the command that was typed, imported; suggests a similar name if there is no such command."""
         name = args[0]
         if name in _COMMANDS:
             return name, _loaded(name), args[1:]
@@ -256,7 +256,7 @@ def orthocapture(
 
 
 def main() -> None:
-    """Entry point of the distribution."""
+    """Run the command line; the entry point of the distribution."""
     begin_loading()  # until the command is loaded
     # With small matrices and many processes, threads of the linear algebra wait for each other and are ten times
     # slower on a busy machine. The library reads this when it is loaded, here and in every child process.

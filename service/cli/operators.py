@@ -151,7 +151,7 @@ class _Operator:
         self.display.tell(message)
 
     def busy(self, what: str) -> None:
-        """Tell the screens what a long call is doing."""
+        """Report to the screens what a long call is doing."""
         self.display.reporter.busy(what)
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
@@ -161,10 +161,10 @@ class _Operator:
         self.display.reporter.attend(doing, state.current, attempt, pedal_armed=pedal_armed, asks=asks, words=words)
 
     def stuck(self, why: str, for_s: float) -> None:
-        """Let the person who was told put it right, however long that takes."""
+        """Let the person who was asked put it right, however long that takes."""
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """The items that a confirmation ticks: the whole list, as the terminal says."""
+        """Return the items that a confirmation ticks: the whole list, as the terminal says."""
         return question.checklist
 
     def close(self) -> None:
@@ -184,11 +184,11 @@ class ScreenOperator(_Operator):
     """People at screens, whose answers arrive as events; this process only watches the pedal."""
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
-        """Always None: the web process records what people do."""
+        """Return None always: the web process records what people do."""
         return None
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """The items ticked on a screen: the pedal does no more than the button there."""
+        """Return the items ticked on a screen: the pedal does no more than the button there."""
         return state.steps[question.step].ticked
 
 
@@ -206,7 +206,7 @@ class TerminalOperator(_Operator):
     """A person who types; the terminal is polled, so that pedal and web can answer as well."""
 
     descriptor: int = 0  # file descriptor of the terminal
-    preview: Callable[[str], str] = lambda _step: ""  # what a step will do, in words; "" if unknown
+    preview: Callable[[str], str] = lambda _step: ""  # describes what a step will do; "" if unknown
     people: People | None = None  # accounts of the site, for actions that need a role
     who: Identity | None = None  # the person who types
     _asked: AskOperator | None = None
@@ -231,7 +231,10 @@ class TerminalOperator(_Operator):
         return action
 
     def _line(self) -> str | None:
-        """A complete line, or None. Not read through sys.stdin, whose buffer would hide further lines from select."""
+        """Return a complete line, or None.
+
+        Not read through sys.stdin, whose buffer would hide further lines from select.
+        """
         while b"\n" not in self._typed:
             if not select.select([self.descriptor], [], [], 0)[0]:
                 return None
@@ -340,7 +343,7 @@ class TerminalOperator(_Operator):
 
 
 def _elsewhere(protocol: Protocol, state: RunState, asked: AskOperator) -> tuple[Asks, str]:
-    """A question in a few words, for people who are elsewhere; what a step asks for in its course is no trouble."""
+    """Return a question in a few words for people elsewhere; what a step asks for in its course is no trouble."""
     title, wanted = protocol.step(asked.step).title, state.step.in_course
     if wanted is not None:
         return "confirm", f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}"
@@ -349,7 +352,7 @@ def _elsewhere(protocol: Protocol, state: RunState, asked: AskOperator) -> tuple
 
 
 def _ways_lines(question: AskOperator) -> list[str]:
-    """The choices, the recommended one first, each with what to type, its time and what it loses."""
+    """Return the choices, the recommended one first, each with what to type, its time and what it loses."""
     lines = ["\nWhat can be done now, the recommended first:"] if question.ways else []
     for way in question.ways:
         if way.available:
@@ -397,7 +400,7 @@ class AutomaticOperator(_Operator):
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
-    """The part of an import that a step imports; None if it imports nothing."""
+    """Return the part of an import that a step imports; None if it imports nothing."""
     params = protocol.step(step_id).params
     match params:
         case image_import.Params():

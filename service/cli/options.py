@@ -23,7 +23,7 @@ PasswordOption = Annotated[
 
 
 def acting_person(store: Store, operator: str, *, password_stdin: bool) -> Identity:
-    """The person who acts at this terminal: the given name, or that of the machine's user.
+    """Return the person who acts at this terminal: the given name, or that of the machine's user.
 
     The name of an account needs its password. Raises ConfigurationError, SignInRefusedError.
     """
@@ -32,7 +32,7 @@ def acting_person(store: Store, operator: str, *, password_stdin: bool) -> Ident
 
 
 def typed_password(name: str, *, from_stdin: bool) -> str:
-    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError if none is given."""
+    """Return a password from the keyboard, or the next line of stdin. Raises ConfigurationError if none is given."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     try:
@@ -51,7 +51,7 @@ RemarksOption = Annotated[str, typer.Option("--remarks", help="Anything else for
 
 
 def described(specimen: str, *, purpose: str, site: str, remarks: str) -> RunAbout:
-    """What a person enters about a run; in a terminal a specimen that is not given is asked for.
+    """Return what a person enters about a run; ask for the specimen in a terminal if it is not given.
 
     Raises ConfigurationError if it is not named, or a text is too long.
     """

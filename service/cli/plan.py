@@ -89,7 +89,7 @@ def _board_record(step: Step, board: BoardPreview) -> dict[str, Any]:
 
 
 def _coverage_text(counts: Sequence[Sequence[int]]) -> str:
-    """Number of corners expected in each cell of the image, row by row; a dot for none."""
+    """Return the number of corners expected in each cell of the image, row by row; a dot for none."""
     width = max(len(str(n)) for row in counts for n in row)
     return "\n".join("    " + " ".join((str(n) if n else "·").rjust(width) for n in row) for row in counts)
 

@@ -190,7 +190,7 @@ def register_command(
 
 
 def _gates(result: PipelineResult) -> list[Gate]:
-    """The limits of a registration: those of the shipped protocols' evaluation, and that nothing contradicts."""
+    """Return the limits of a registration: those of the shipped protocols' evaluation, and of contradictions."""
     gates = [
         Gate(measure="contradictions", max=0, unit="", why="inputs that contradict one another give no registration"),
         Gate(measure="predicted_error_mm", max=_MOST_MM, unit="mm", why="the paper's figure"),
@@ -230,7 +230,7 @@ def _tell(result: PipelineResult, record: dict[str, Any], verdicts: Sequence[Gat
 def _file_detector(
     detector: DetectorName, boxes: Path | None, names: list[str], folder: Path | None, least: int
 ) -> tuple[DetectFile | None, Mapping[str, str]]:
-    """The detector for one file, None for the default, and the hashes of its weights, if it has any."""
+    """Return the detector for one file, None for the default, and the hashes of its weights, if it has any."""
     if boxes is not None and detector != "paper":
         raise typer.BadParameter("--boxes needs --detector paper")
     if detector == "paper":
@@ -242,7 +242,7 @@ def _file_detector(
 
 
 def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:
-    """Counts of images searched whole and at predicted places only, and the spheres missing there, as plain data."""
+    """Return counts of images searched whole or at predicted places only, and of missing spheres, as plain data."""
     return {
         "images_searched": located.count("searched"),
         "images_predicted": located.count("predicted"),
@@ -264,7 +264,7 @@ def _spheres(
     control: str,
     seeds: str | None,
 ) -> tuple[Array, Array, float]:
-    """Centres of registration (M, 3) and control spheres (C, 3), and their radius, in metres."""
+    """Return centres of registration (M, 3) and control spheres (C, 3), and their radius, in metres."""
     if (mesh is None) == (spheres is None):
         raise typer.BadParameter("give either --mesh or --spheres")
     if spheres is not None:

@@ -95,7 +95,7 @@ def replay_command(
 
 
 def report_json(report: ReplayReport) -> dict[str, Any]:
-    """A replay report as plain data, with the verdicts added."""
+    """Return a replay report as plain data, with the verdicts added."""
     plain: dict[str, Any] = {"verdict": report.verdict, **asdict(report)}
     for job, shown in zip(report.jobs, plain["jobs"], strict=True):
         shown["differences"] = [_plain(difference) for difference in job.differences]
@@ -112,7 +112,7 @@ def report_json(report: ReplayReport) -> dict[str, Any]:
 
 
 def _plain(difference: Difference) -> dict[str, Any]:
-    """A difference as plain data, with None for infinities, which JSON does not have."""
+    """Return a difference as plain data, with None for infinities, which JSON does not have."""
     plain = {**asdict(difference), "within_tolerance": difference.within_tolerance}
     for name in ("difference", "relative"):
         if plain[name] == float("inf"):

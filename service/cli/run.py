@@ -207,7 +207,7 @@ def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Dis
 
 @contextmanager
 def _told_to_leave() -> Generator[threading.Event]:
-    """An event set by Ctrl-C and SIGTERM; an exception could get lost in a finaliser or callback."""
+    """Yield an event set by Ctrl-C and SIGTERM; an exception could get lost in a finaliser or callback."""
     leave = threading.Event()
     before = {number: signal.signal(number, lambda *_: leave.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -373,7 +373,7 @@ def drive(
 
 
 def open_devices(station: Station) -> OpenDevices:
-    """The devices that are open now, for the screens."""
+    """Return the devices that are open now, for the screens."""
     return OpenDevices(
         robots=cast(dict[str, RobotArm], station.opened("robot")),
         cameras=cast(dict[str, Camera], station.opened("camera")),
@@ -382,7 +382,7 @@ def open_devices(station: Station) -> OpenDevices:
 
 
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
-    """What a capture step will do, in words, for the person who is asked to confirm it."""
+    """Describe what a capture step will do for the person who is asked to confirm it."""
     # Planning takes half a second to load, which a run that is answered on the screen does without.
     from service.steps.plan_preview import preview_board_poses, preview_plans  # noqa: PLC0415
 

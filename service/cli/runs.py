@@ -65,12 +65,12 @@ def runs_command(
 
 
 def by(run: FoundRun) -> str:
-    """Who worked at the rig, or, if not stated, who began the run."""
+    """Return who worked at the rig or, if that was not given, who started the run."""
     return run.about.operator or run.begun_by
 
 
 def result_words(run: FoundRun) -> str:
-    """A run's result in words, such as `completed, 0.213 mm (within), released`."""
+    """Return a run's result as text, such as `completed, 0.213 mm (within), released`."""
     words = [RESULT_WORDS[run.status]]
     if run.accuracy is not None:
         words.append(run.accuracy.words)

@@ -57,7 +57,7 @@ _LIMITS = ConnectionLimits()
 
 @dataclass(frozen=True, slots=True)
 class _Server:
-    """The server of a data folder, as others are told of it."""
+    """The server of a data folder, as other processes find it."""
 
     address: str
     user: str
@@ -159,7 +159,7 @@ def serve_command(
 
 @contextmanager
 def _only_server(store: Store) -> Generator[Callable[[str], None]]:
-    """Be the only server of a data folder; yields what tells others the address of this one.
+    """Be the only server of a data folder; yields a function that publishes the address of this one.
 
     The system lets go of the lock when the process ends, however it ends. Raises ConfigurationError where the folder
     is served already, StoreError if the folder cannot be written to.
@@ -179,7 +179,7 @@ def _only_server(store: Store) -> Generator[Callable[[str], None]]:
 
 
 def _locked(path: Path) -> FileIO:
-    """The file that tells of this server, empty and locked. Raises ConfigurationError, StoreError."""
+    """Return the file that announces this server, empty and locked. Raises ConfigurationError, StoreError."""
     try:
         file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+")
         try:

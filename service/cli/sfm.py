@@ -148,7 +148,7 @@ def _robot_poses(path: Path | None, hand_eye: Path | None, files: Mapping[str, P
 def _spheres(
     mesh: Path | None, spheres: Path | None, radius_mm: float | None, mesh_unit: MeshUnit
 ) -> tuple[Array, float]:
-    """Sphere centres (M, 3) and radius, in metres."""
+    """Return sphere centres (M, 3) and radius, in metres."""
     if spheres is not None:
         known = read_spheres_json(spheres)
         return known.centres_m, known.radius_m if radius_mm is None else metres(radius_mm)
@@ -178,7 +178,7 @@ def _reconstruct(
     prior: Mapping[str, Transform] | None,
     stations: Mapping[str, str] | None,
 ) -> tuple[SfmModel, float | None]:
-    """The model, and the rms distance in metres of the robot's poses from it (None without them).
+    """Return the model, and the rms distance in metres of the robot's poses from it (None without them).
 
     If the robot's poses are in another frame or images are missing, it matches all pairs and reconstructs again.
     """
@@ -199,7 +199,7 @@ def _reconstruct(
 def _disagreement(
     solved: SfmModel, prior: Mapping[str, Transform], stations: Mapping[str, str] | None
 ) -> tuple[float, float]:
-    """Rms distance between the robot's and the reconstructed camera positions, and the cameras' spread, in metres."""
+    """Return the rms distance of the robot's from the reconstructed camera positions, and the cameras' spread, m."""
     squares: list[float] = []
     spread: list[float] = []
     groups = sorted({stations[name] for name in solved.T_world_camera}) if stations else [""]

@@ -122,7 +122,7 @@ def _limits(
     max_form_mm: float | None,
     min_cap_deg: float | None,
 ) -> SphereLimits:
-    """The default limits with those given instead, as fractions of the radius."""
+    """Return the default limits with those given instead, as fractions of the radius."""
     given = {"max_rms": max_rms_mm, "max_radius_residual": max_radius_off_mm, "max_form": max_form_mm}
     changed = {name: metres(value) / radius_m for name, value in given.items() if value is not None}
     if min_cap_deg is not None:
@@ -132,7 +132,7 @@ def _limits(
 
 
 def _with_limits(error: ComputeError, limits: SphereLimits, radius_mm: float) -> ComputeError:
-    """The error with the limits that were applied and the options that change them."""
+    """Return the error with the limits that were applied and the options that change them."""
     words = (
         f"Judged by --max-rms-mm {limits.max_rms * radius_mm:.3g}, "
         f"--max-radius-off-mm {limits.max_radius_residual * radius_mm:.3g}, "
@@ -149,7 +149,7 @@ def spheres_of(
     seeds: str | None,
     limits: SphereLimits | None = None,
 ) -> tuple[MeshSphere, ...]:
-    """The spheres in a mesh or point cloud file, in metres, in the order of the seeds if given.
+    """Return the spheres in a mesh or point cloud file, in metres, in the order of the seeds if given.
 
     Raises:
         DataError: the file or the seeds cannot be used.
@@ -183,7 +183,7 @@ def spheres_of(
 
 
 def _of_another_radius(error: ComputeError, seen: MeasuredRadius, radius_m: float) -> ComputeError:
-    """The error for spheres of another radius, which it names."""
+    """Return the error for spheres of another radius, which it names."""
     count = len(seen.spheres)
     where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*mm(s.centre_m)) for s in seen.spheres[:_NAMED])
     more = ", …" if count > _NAMED else ""
@@ -197,7 +197,7 @@ def _of_another_radius(error: ComputeError, seen: MeasuredRadius, radius_m: floa
 
 
 def read_seeds(text: str | None) -> Array | None:
-    """Seeds (K, 3) in metres from text or a file in millimetres; None if none are given.
+    """Return seeds (K, 3) in metres from text or a file in millimetres; None if none are given.
 
     Args:
         text: "x,y,z;x,y,z", or the path of a JSON file with a list of [x, y, z], or with an object that has such a

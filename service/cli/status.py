@@ -105,7 +105,7 @@ def _standing(verdict: GateVerdict, step: StepState) -> Standing:
 
 
 def status_record(run_id: str, state: RunState) -> dict[str, Any]:
-    """A run's state as plain data, for JSON output."""
+    """Return a run's state as plain data, for JSON output."""
     return {
         "run": run_id,
         "status": state.status,
@@ -134,7 +134,7 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
 
 
 def next_best_views(state: RunState) -> tuple[live_summary.Suggestion, ...]:
-    """The suggested views in a run's newest summary of its images; empty before the first one."""
+    """Return the suggested views in a run's newest summary of its images; empty before the first one."""
     jobs = [job for step in state.steps.values() for job in step.jobs.values()]
     done = [job for job in jobs if job.kind == live_summary.KIND.name and job.status == "finished"]
     newest = max(done, key=lambda job: job.enqueued_seq, default=None)

@@ -31,7 +31,7 @@ class Terminal(Console):
         super().__init__(**given)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """A string as it is printed; Rich calls this for everything that is not a Text."""
+        """Return a string as it is printed; Rich calls this for everything that is not a Text."""
         given: dict[str, Any] = {**options, "markup": False, "emoji": False}
         return super().render_str(shown_continued(text), **given)
 
@@ -49,26 +49,26 @@ class Terminal(Console):
 
 
 def styled(*pieces: Piece) -> Text:
-    """Pieces of text with their styles as one line, for a cell of a table, say."""
+    """Return pieces of text with their styles as one line, for a cell of a table, say."""
     given = ((piece, "") if isinstance(piece, str) else piece for piece in pieces)
     return Text.assemble(*((shown_continued(text), style) for text, style in given))
 
 
 def listed(*lines: RenderableType) -> Text:
-    """Lines within one cell of a table, without the empty ones."""
+    """Return lines within one cell of a table, without the empty ones."""
     made = (line if isinstance(line, Text) else styled(str(line)) for line in lines)
     return Text("\n").join([line for line in made if line.plain])
 
 
 def bar_of_shares(to: Terminal) -> Progress:
-    """A progress bar that shows the share that is done. Its words are not escaped: give them `shown`."""
+    """Return a progress bar that shows the share that is done. Its words are not escaped: give them `shown`."""
     from rich.progress import TaskProgressColumn  # noqa: PLC0415 - most commands have no bar
 
     return _bar(to, "{task.description}", TaskProgressColumn())
 
 
 def bar_of_counts(to: Terminal) -> Progress:
-    """A progress bar that shows how many are done. Its words are not escaped: give them `shown`."""
+    """Return a progress bar that shows how many are done. Its words are not escaped: give them `shown`."""
     from rich.progress import MofNCompleteColumn  # noqa: PLC0415
 
     return _bar(to, "  {task.description}", MofNCompleteColumn())

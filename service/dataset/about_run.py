@@ -1,4 +1,4 @@
-"""Tells what the record of a run says about its data set, for its card and for dataset.json."""
+"""Reads what the record of a run says about its data set, for its card and for dataset.json."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def about_run(
     version: str = FIRST_VERSION,
     personal: bool = True,
 ) -> About:
-    """What a run's data set says about itself.
+    """Return what a run's data set says about itself.
 
     Args:
         summary: the run.
-        own: name of its registration.
-        not_in_yet: results that have not arrived yet, in words.
-        stated: replaces what the protocol states.
-        version: of the data set.
+        own: the name of its registration.
+        not_in_yet: texts on results that have not arrived yet.
+        stated: the statement that replaces the protocol's.
+        version: the data set's version.
         personal: False leaves people and serial numbers out.
     """
     root, entered = summary.root, summary.root.about
@@ -68,7 +68,7 @@ def about_run(
 
 
 def gates_in_words(summary: RunSummary) -> dict[str, tuple[str, ...]]:
-    """Each judged step's gates in words, with their verdicts."""
+    """Return each judged step's gates as text, with their verdicts."""
     steps = {step.id: summary.state.steps[step.id] for step in summary.protocol.steps}
     return {
         name: tuple(
@@ -81,7 +81,7 @@ def gates_in_words(summary: RunSummary) -> dict[str, tuple[str, ...]]:
 
 
 def origin_sentence(summary: RunSummary, *, personal: bool = True) -> str:
-    """How the photographs came into the run."""
+    """Return how the photographs came into the run."""
     if summary.root.origin != "imported":
         return "The photographs were captured in this run"
     by = summary.root.operator if personal else _UNNAMED
@@ -89,7 +89,7 @@ def origin_sentence(summary: RunSummary, *, personal: bool = True) -> str:
 
 
 def _fusion(summary: RunSummary, *, personal: bool) -> tuple[tuple[str, str], ...]:
-    """How CT and scan agree, and what of the mesh comes from where."""
+    """Return how CT and scan agree, and what of the mesh comes from where."""
     fusion = recorded_fusion(summary)
     if fusion is None:
         return ()
@@ -122,7 +122,7 @@ def _fusion(summary: RunSummary, *, personal: bool) -> tuple[tuple[str, str], ..
 
 
 def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:
-    """Every device as it first identified itself in the run."""
+    """Return every device as it first identified itself in the run."""
     known = bodies(summary.events)
     found: dict[str, UsedDevice] = {}
     for event in summary.events:
@@ -135,7 +135,7 @@ def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:
 
 
 def _settings(summary: RunSummary) -> tuple[tuple[str, str], ...]:
-    """Camera settings of the protocol, the lens as the photographs state it, and the spheres."""
+    """Return the camera settings of the protocol, the lens as the photographs state it, and the spheres."""
     camera, spheres = summary.protocol.camera, summary.protocol.spheres
     optics = [recorded_optics(view.camera) for view in summary.captures()]
     lenses = dict.fromkeys(one.lens for one in optics if one.lens)
@@ -162,7 +162,7 @@ def _settings(summary: RunSummary) -> tuple[tuple[str, str], ...]:
 def described_run(
     summary: RunSummary, own: str, not_in_yet: Sequence[str], *, personal: bool = True
 ) -> dict[str, Any]:
-    """What `dataset.json` says of the run, as plain data; `own` is the name of its registration."""
+    """Return what `dataset.json` says of the run as plain data; `own` is the name of its registration."""
     later = summary.better_later()
     return {
         "run": summary.run_id,

@@ -19,10 +19,10 @@ BESIDE = {
 
 
 def card(dataset: DataSet, words: str, description: str) -> str:
-    """The data card as Markdown.
+    """Return the data card as Markdown.
 
     Args:
-        dataset: as it is written.
+        dataset: the data set as it is written.
         words: the format in a few words.
         description: the docstring of the format's writer, which explains its files.
     """
@@ -178,5 +178,5 @@ def _list(items: Sequence[str], none: str) -> list[str]:
 
 
 def _paragraphs(docstring: str) -> str:
-    """The docstring without its section of errors."""
+    """Return the docstring without its section of errors."""
     return inspect.cleandoc(docstring).split("\nRaises:")[0].strip()

@@ -29,12 +29,12 @@ _FORMATS = {
 
 
 def media_type(path: str) -> str:
-    """The media type of a file, by the end of its name."""
+    """Return the media type of a file, by the end of its name."""
     return _FORMATS.get(path.rpartition(".")[2], "application/octet-stream")
 
 
 def descriptor() -> Entity:
-    """The entity of the metadata file itself."""
+    """Return the entity of the metadata file itself."""
     return {
         "@id": METADATA,
         "@type": "CreativeWork",
@@ -44,7 +44,7 @@ def descriptor() -> Entity:
 
 
 def file_entity(path: str, sha256: str, size_bytes: int, description: str = "") -> Entity:
-    """A file of the crate."""
+    """Return a file of the crate."""
     return {
         "@id": path,
         "@type": "File",
@@ -57,18 +57,18 @@ def file_entity(path: str, sha256: str, size_bytes: int, description: str = "") 
 
 
 def software(version: str) -> Entity:
-    """This program."""
+    """Return the entity of this program."""
     return {"@id": "#software", "@type": "SoftwareApplication", "name": "orthocapture", "softwareVersion": version}
 
 
 def person(account: str, full_names: Mapping[str, str]) -> Entity:
-    """By full name; the account, as the records have it, is the other name."""
+    """Return a person's entity: the full name, and as the other name the account, as the records have it."""
     found = {"@id": anchor("person", account), "@type": "Person", "name": full_names.get(account) or account}
     return found if found["name"] == account else found | {"alternateName": account}
 
 
 def device(name: str, model: str, firmware: str, serial: str) -> Entity:
-    """A device as it first answered."""
+    """Return a device as it first answered."""
     return {
         "@id": anchor("device", name),
         "@type": "IndividualProduct",
@@ -79,18 +79,18 @@ def device(name: str, model: str, firmware: str, serial: str) -> Entity:
 
 
 def anchor(kind: str, name: str) -> str:
-    """An identifier within the crate that is a valid URI reference."""
+    """Return an identifier within the crate that is a valid URI reference."""
     return f"#{kind}-" + "".join(c if c.isascii() and c.isalnum() else f"_{ord(c):x}_" for c in name)
 
 
 def crate(dataset: DataSet, words: str, files: Sequence[ListedFile], described: Mapping[str, str]) -> dict[str, Any]:
-    """The metadata as plain data.
+    """Return the metadata as plain data.
 
     Args:
-        dataset: as it is written.
+        dataset: the data set as it is written.
         words: the format in a few words.
-        files: of the folder, without this one.
-        described: what a file is, by its name.
+        files: the files of the folder, without this one.
+        described: a description of each file, by its name.
     """
     about = dataset.about
     people = [person(name, {}) for name in about.people]
@@ -152,7 +152,7 @@ def _root(dataset: DataSet, words: str) -> Entity:
 
 
 def _run(about: About, devices: Sequence[Entity]) -> Entity:
-    """The run that made the data set, and the head of its chain of evidence."""
+    """Return the run that made the data set, and the head of its chain of evidence."""
     return {
         "@id": "#run",
         "@type": "CreateAction",
@@ -165,7 +165,7 @@ def _run(about: About, devices: Sequence[Entity]) -> Entity:
 
 
 def _licence(about: About) -> Entity:
-    """By its address, as RO-Crate wants it; in words where it has none."""
+    """Return the licence's entity: its address, as RO-Crate wants it, or its text if it has none."""
     address = about.licence_address
     if not address:
         return {"@id": "#licence", "@type": "CreativeWork", "name": "Licence", "description": about.licence}
@@ -173,7 +173,7 @@ def _licence(about: About) -> Entity:
 
 
 def _parties(kind: str, found: Sequence[Party]) -> list[Entity]:
-    """People by their ORCID and bodies by their ROR, where they have one."""
+    """Return people by their ORCID and bodies by their ROR, where they have one."""
     return [
         {"@id": one.address or anchor(kind, one.name), "@type": one.kind, "name": one.name, **_names(one)}
         for one in found

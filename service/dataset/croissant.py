@@ -46,7 +46,7 @@ Parts = Mapping[str, Mapping[str, str]]  # role → view → file
 
 
 def view_columns(parts: Parts) -> dict[str, str]:
-    """The columns in order, each with what it holds."""
+    """Return the columns in order, each with what it holds."""
     return {
         "name": "name of the view",
         **{role: f"{role} of the view, a file of this folder" for role in parts},
@@ -68,7 +68,7 @@ def view_columns(parts: Parts) -> dict[str, str]:
 
 
 def views_csv(dataset: DataSet, parts: Parts) -> bytes:
-    """The table; `parts` names the files of each view, relative to the folder."""
+    """Return the table; `parts` names the files of each view, relative to the folder."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(view_columns(parts))
@@ -107,14 +107,14 @@ _TYPES = {
 def croissant(
     dataset: DataSet, words: str, files: Sequence[ListedFile], parts: Parts, described: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The metadata as plain data.
+    """Return the metadata as plain data.
 
     Args:
-        dataset: as it is written.
+        dataset: the data set as it is written.
         words: the format in a few words.
-        files: of the folder, without this one.
+        files: the files of the folder, without this one.
         parts: the files of the views: role → view → file.
-        described: what a file is, by its name.
+        described: a description of each file, by its name.
     """
     about = dataset.about
     marked = "SIMULATED " if dataset.simulated else ""
@@ -167,7 +167,7 @@ def _file_object(file: ListedFile, described: Mapping[str, str]) -> dict[str, An
 
 
 def _file_set(role: str, files: Iterable[str]) -> dict[str, Any]:
-    """The files of one role, which lie in folders of their own."""
+    """Return the files of one role, which lie in folders of their own."""
     paths = [PurePosixPath(file) for file in files]
     return {
         "@type": "cr:FileSet",
@@ -180,7 +180,7 @@ def _file_set(role: str, files: Iterable[str]) -> dict[str, Any]:
 
 
 def _views(parts: Parts) -> dict[str, Any]:
-    """One record for each view, from views.csv."""
+    """Return one record for each view, from views.csv."""
     columns = view_columns(parts)
     return {
         "@type": "cr:RecordSet",
@@ -207,7 +207,7 @@ def _is_pictures(role: str, files: Iterable[str]) -> bool:
 
 
 def _pictures(role: str) -> dict[str, Any]:
-    """One record for each picture of a role: its file, as views.csv names it, and its pixels."""
+    """Return one record for each picture of a role: its file, as views.csv names it, and its pixels."""
     name = f"{role}_pixels"
     fields = {
         "file": ("sc:Text", "fullpath", f"the file, as the field {role} of the views names it"),

@@ -18,12 +18,12 @@ from service.store.durable_effects import DurableFiles
 
 @dataclass(frozen=True, slots=True)
 class ListedFile:
-    """A file.
+    """A file of an export.
 
     Attributes:
-        path: relative to the folder, with `/`.
-        sha256: of its content.
-        size_bytes: of its content.
+        path: the file's path, relative to the folder, with `/`.
+        sha256: hash of its content.
+        size_bytes: size of its content.
     """
 
     path: str
@@ -64,19 +64,19 @@ def check_folder(folder: Path) -> int:
 
 
 class Part(NamedTuple):
-    """What a file is to a view."""
+    """The role of a file for a view."""
 
     role: Literal["image", "depth", "mask", "arrays"]
     view: str
 
 
 def json_bytes(document: object) -> bytes:
-    """A document as the UTF-8 text of a JSON file."""
+    """Return a document as the UTF-8 text of a JSON file."""
     return (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode()
 
 
 class ExportFolder:
-    """Where a format's writer puts its files."""
+    """The folder into which a format's writer puts its files."""
 
     def __init__(self, root: Path, told: Callable[[int], None] = lambda _count: None) -> None:
         """Write into `root`; `told` is called with the number of files after each of them."""
@@ -105,8 +105,8 @@ class ExportFolder:
         """Let `write` make a file at a temporary path; the file gets its name only when it is complete.
 
         Args:
-            name: of the file, relative, with `/`.
-            write: makes it.
+            name: the file's name, relative, with `/`.
+            write: makes the file at the path that it gets.
             part: the view to which it belongs, if it does.
 
         Raises:
@@ -130,7 +130,7 @@ class ExportFolder:
             self.parts.setdefault(part.role, {})[part.view] = name
 
     def listed(self) -> list[ListedFile]:
-        """The files that were written up to now, in order of their names; each is hashed once."""
+        """Return the files that were written up to now, in order of their names; each is hashed once."""
         found: list[ListedFile] = []
         for name, known in sorted(self._written.items()):
             path = self._root / name
@@ -158,12 +158,12 @@ class _Listed(ExportFolder):
     """Counts what a writer would write, and writes nothing."""
 
     def written_by(self, name: str, write: Callable[[Path], object], part: Part | None = None) -> None:
-        """Only remember the name."""
+        """Remember the name, and write nothing."""
         del write
         self._named(name, part)
 
     def anew(self, name: str, make: Callable[[], bytes]) -> None:
-        """Only remember the name."""
+        """Remember the name, and write nothing."""
         self.file(name, make)
 
     @property
@@ -173,7 +173,7 @@ class _Listed(ExportFolder):
 
 
 def count_files(write: Callable[[ExportFolder], object]) -> int:
-    """The number of files that a writer makes; none is made."""
+    """Return the number of files that a writer makes; none is made."""
     listed = _Listed(Path())
     write(listed)
     return listed.count
@@ -186,16 +186,16 @@ def export_folder(
     leaving: Callable[[Path], None] = lambda _sums: None,
     told: Callable[[int], None] = lambda _count: None,
 ) -> Generator[ExportFolder]:
-    """A folder that appears at `target` when the block ends without an error.
+    """Yield a folder that appears at `target` when the block ends without an error.
 
     Until then it is `.NAME.part` beside it. After an interruption the same export keeps the files that are complete;
     another export starts again.
 
     Args:
         target: a new folder in an existing one.
-        identity: of what is exported, and how.
-        leaving: called with the list of checksums when all is written, before the folder has its name.
-        told: called with the number of files that are there, after each of them.
+        identity: a text that identifies what is exported, and how.
+        leaving: a function called with the list of checksums when all is written, before the folder has its name.
+        told: a function that is called with the number of files that are there, after each of them.
 
     Raises:
         DataError: the target exists, its parent does not, or something else has the name of the unfinished folder.
@@ -227,7 +227,7 @@ def export_folder(
 
 
 def being_written(target: Path) -> bool:
-    """Whether a process is writing the export of this folder now."""
+    """Return whether a process is writing the export of this folder now."""
     about = _beside(target)[1]
     try:
         with about.open("rb") as lock:
@@ -240,7 +240,7 @@ def being_written(target: Path) -> bool:
 
 
 def interrupted(target: Path) -> bool:
-    """Whether an export of this folder was begun and neither ended nor discarded; also while it is being written."""
+    """Return whether an export of this folder was started and neither ended nor discarded, or is being written."""
     root, about = _beside(target)
     return root.is_dir() and about.is_file()
 
@@ -262,7 +262,7 @@ def discard(target: Path) -> None:
 
 
 def _beside(target: Path) -> tuple[Path, Path]:
-    """The unfinished folder, and the file that says what is being written and locks it."""
+    """Return the unfinished folder, and the file that says what is being written and locks it."""
     return target.with_name(f".{target.name}{_PART}"), target.with_name(f".{target.name}{_ABOUT}")
 
 

@@ -27,7 +27,7 @@ _SPLITS = TypeAdapter(Splits)
 
 
 def data_set_of_folder(folder: Path) -> DataSet:
-    """The data set that `orthocapture export --format hdf5` wrote; its identity is the SHA-256 of its `SHA256SUMS`.
+    """Return the data set that `orthocapture export --format hdf5` wrote; its identity is its `SHA256SUMS`' SHA-256.
 
     Raises:
         DataError: the folder is in another format, a file of it was changed or is missing, or it cannot be read.
@@ -51,27 +51,27 @@ class StoredPixels:
         self._folder, self._mark = folder, mark
 
     def picture(self, view: PosedView) -> bytes:
-        """The pixels as PNG: the camera's own file is not in the folder."""
+        """Return the pixels as PNG: the camera's own file is not in the folder."""
         return png(self.colours(view), self._mark)
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR."""
+        """Return the colours (H, W, 3), BGR."""
         return np.ascontiguousarray(self._array(view, "image")[..., ::-1], dtype=np.uint8)
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh."""
+        """Return the depth (H, W), z of the mesh."""
         return self._array(view, "depth_m").astype(np.float32)
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) normals of the mesh."""
+        """Return the normals (H, W, 3) of the mesh."""
         return self._array(view, "normal").astype(np.float32)
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """Pixels that the photograph has."""
+        """Return which pixels the photograph has, (H, W)."""
         return self._array(view, "valid").astype(np.bool_)
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Spheres and posts."""
+        """Return which pixels show a sphere or a post, (H, W)."""
         return self._array(view, "markers").astype(np.bool_)
 
     def _array(self, view: PosedView, name: str) -> NDArray[Any]:
@@ -83,7 +83,7 @@ class StoredPixels:
 
 
 def scaled_data_set(dataset: DataSet, width: int) -> DataSet:
-    """The data set with pictures, depth and masks reduced to this width in pixels.
+    """Return the data set with pictures, depth and masks reduced to this width in pixels.
 
     Raises:
         DataError: a view is narrower.
@@ -127,7 +127,7 @@ class _Scaled:
         return self._nearest(self._whole.pixels.markers(self._views[view.name]), view).astype(np.bool_)
 
     def _nearest(self, pixels: NDArray[Any], view: PosedView) -> NDArray[Any]:
-        """The values (H, W, …) at the centres of the larger pixels."""
+        """Return the values (H, W, …) at the centres of the larger pixels."""
         rows, columns = (
             ((np.arange(small) + 0.5) * (large / small)).astype(np.int64)
             for small, large in zip((view.camera.height, view.camera.width), pixels.shape[:2], strict=True)

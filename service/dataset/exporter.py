@@ -20,11 +20,11 @@ Progress = Callable[[str, int, int], None]  # activity, files done, files in tot
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A format.
+    """An export format.
 
     Attributes:
-        name: as it is named on the command line.
-        words: what it is, and who reads it.
+        name: the format's name on the command line.
+        words: a few words on the format and who reads it.
         write: puts the files of a data set into a folder; units and frames are stated in its docstring.
         pinhole: the format has no distortion, so it gets undistorted images.
         one_camera: the format has one camera, so it gets only the images of the rig's first one.
@@ -38,7 +38,7 @@ class Exporter:
 
 
 def exporters() -> dict[str, Exporter]:
-    """Every format by its name.
+    """Return every format by its name.
 
     Raises:
         ConfigurationError: two have the same name, or an entry point names something else.
@@ -47,7 +47,7 @@ def exporters() -> dict[str, Exporter]:
 
 
 def exporter(name: str) -> Exporter:
-    """The format of this name.
+    """Return the format of this name.
 
     Raises:
         ConfigurationError: there is none.
@@ -67,12 +67,12 @@ def write_data_set(
     """Write a data set into a new folder, with what every folder has beside the format.
 
     Args:
-        dataset: as photographed; it is undistorted here where the format needs that.
+        dataset: the data set as photographed; it is undistorted here where the format needs that.
         how: the format.
         target: a new folder; it appears when it is whole.
         personal: False leaves GPS, owner and serial numbers out of resampled pictures.
-        leaving: called with the list of checksums when all is written, before the folder has its name.
-        progress: called with the activity, the files done and their total.
+        leaving: a function called with the list of checksums when all is written, before the folder has its name.
+        progress: a function that is called with the activity, the files done and their total.
 
     Raises:
         DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.
@@ -86,13 +86,13 @@ def write_data_set(
 
 
 def _write(dataset: DataSet, how: Exporter, folder: ExportFolder) -> None:
-    """The files of the format, and those that every folder has."""
+    """Write the files of the format, and those that every folder has."""
     how.write(dataset, folder)
     write_package(dataset, folder, form=how.name, words=how.words, description=how.write.__doc__ or "")
 
 
 def _told(dataset: DataSet, how: Exporter, progress: Progress | None) -> Callable[[int], None]:
-    """Turns a number of files into progress."""
+    """Return a function that turns a number of files into progress."""
     if progress is None:
         return lambda _count: None
     total = count_files(lambda folder: _write(dataset, how, folder))
@@ -106,13 +106,13 @@ _DESCRIBED = {
 
 
 def write_package(dataset: DataSet, folder: ExportFolder, *, form: str, words: str, description: str) -> None:
-    """dataset.json, splits.json, views.csv, the data card, Croissant and RO-Crate; the format's files come before.
+    """Write dataset.json, splits.json, views.csv, data card, Croissant and RO-Crate, after the format's files.
 
     They are written again when an interrupted export goes on, because they depend on the whole record.
 
     Args:
-        dataset: as the format got it.
-        folder: with the files of the format.
+        dataset: the data set as the format got it.
+        folder: the folder with the files of the format.
         form: the format's name.
         words: the format in a few words.
         description: the docstring of its writer, which explains its files.

@@ -25,13 +25,13 @@ class KnownFurtherCamera:
     """A further camera of a run.
 
     Attributes:
-        name: in rig.yaml.
+        name: the camera's name in rig.yaml.
         mounted: fixed in the room, or rigid beside the first camera.
         optics: body, lens and settings as its first photograph states them.
         calibration: file with its intrinsics.
-        images: by viewpoint, its photograph of each valid view.
+        images: its photograph of each valid view, by viewpoint.
         located: its pose, as the registration step found it; None before that.
-        clock: how far its clock is ahead of the first camera's; None if the photographs do not tell.
+        clock: the offset of its clock from the first camera's; None if the photographs do not show it.
     """
 
     name: str
@@ -44,7 +44,7 @@ class KnownFurtherCamera:
 
     @property
     def outer(self) -> str:
-        """The frame in which its pose is stated, in words."""
+        """A text on the frame in which its pose is given."""
         return "the scan" if self.mounted == "fixed" else "the first camera"
 
     @property
@@ -65,13 +65,13 @@ class KnownFurtherCamera:
 
 
 def pose_sigmas(located: Answer) -> tuple[float, float]:
-    """Standard deviations of a located camera's position (m) and rotation (rad): roots of the traces."""
+    """Return the standard deviations of a located camera's position (m) and rotation (rad): roots of the traces."""
     variances = np.diag(np.array(located.covariance))
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
 
 
 def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | None:
-    """T_scan_camera (4, 4) of a further camera while the first one was at this pose; None where it is not known."""
+    """Return T_scan_camera (4, 4) of a further camera while the first one was at this pose; None if not known."""
     if located.T_outer_camera is None or (located.mounted == "rigid" and T_scan_first is None):
         return None
     T_outer_camera = np.array(located.T_outer_camera)
@@ -81,7 +81,7 @@ def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | No
 def further_poses(
     protocol: Protocol, state: RunState, views: Iterable[RecordedView], T_scan_first: Mapping[str, Matrix]
 ) -> dict[str, dict[str, Transform]]:
-    """T_scan_camera of every further camera by its name: by viewpoint if it is rigid, once if it is fixed."""
+    """Return T_scan_camera of every further camera by its name: by viewpoint if it is rigid, once if it is fixed."""
     found: dict[str, dict[str, Transform]] = {}
     for camera in known_further_cameras(protocol, state, views):
         for viewpoint in camera.images:
@@ -95,7 +95,7 @@ def further_poses(
 def known_further_cameras(
     protocol: Protocol, state: RunState, views: Iterable[RecordedView]
 ) -> tuple[KnownFurtherCamera, ...]:
-    """The further cameras that exposed at these valid views, in the order of the rig file."""
+    """Return the further cameras that exposed at these valid views, in the order of the rig file."""
     captures = [view for view in views if isinstance(view, ViewpointCaptured)]
     located = further_cameras(protocol, state)
     exposures: dict[str, list[tuple[str, FurtherExposure]]] = {}

@@ -27,12 +27,12 @@ class FurtherView:
     """An image of a further camera.
 
     Attributes:
-        name: of the view: that of the viewpoint, and the camera's.
-        viewpoint: at which it was taken.
+        name: the view's name: that of the viewpoint, and the camera's.
+        viewpoint: the viewpoint at which it was taken.
         device: the camera.
-        path, sha256: of the photograph.
+        path, sha256: file and hash of the photograph.
         camera: its intrinsics.
-        T_scan_camera: (4, 4).
+        T_scan_camera: (4, 4) the camera's pose in the frame of the scan, m.
         from_first: (6, 6) how the pose follows an error of the first camera's pose at the viewpoint; 0 if fixed.
         from_mount: (6, 6) how it follows an error of the camera's pose in its outer frame.
         taken: time that the photograph states.
@@ -55,9 +55,9 @@ class FurtherViews:
     """The images of all further cameras that were located.
 
     Attributes:
-        views: in order of their names.
+        views: the views in order of their names.
         mounts: (6, 6) covariance of each camera in its outer frame.
-        statement: what `dataset.json` says of each further camera, also of those that were not located.
+        statement: the entry of `dataset.json` for each further camera, also for those that were not located.
     """
 
     views: tuple[FurtherView, ...]
@@ -65,7 +65,7 @@ class FurtherViews:
     statement: list[dict[str, Any]] = field(repr=False)
 
     def covariances(self, first: Mapping[str, Array]) -> dict[str, Array]:
-        """(6, 6) of each view's pose, given those of the first camera's."""
+        """Return the covariance (6, 6) of each view's pose, given those of the first camera's."""
         return {
             view.name: view.from_first @ first[view.viewpoint] @ view.from_first.T
             + view.from_mount @ self.mounts[view.device] @ view.from_mount.T
@@ -73,7 +73,7 @@ class FurtherViews:
         }
 
     def with_them(self, first: Splits) -> Splits:
-        """The splits with the images of the further cameras.
+        """Return the splits with the images of the further cameras.
 
         An image of a rigid camera is where its viewpoint is. Those of a fixed one all show the same, so they are all
         for training. None is among the sparse views.
@@ -88,7 +88,7 @@ class FurtherViews:
         )
 
     def joint(self, first: Array, viewpoints: Sequence[str]) -> Array:
-        """The joint covariance (6 V, 6 V) of the errors of all poses, in order of the views' names.
+        """Return the joint covariance (6 V, 6 V) of the errors of all poses, in order of the views' names.
 
         Args:
             first: (6 N, 6 N) of the first camera's poses.
@@ -115,7 +115,7 @@ class FurtherViews:
 
 
 def further_views(summary: RunSummary, T_scan_first: Mapping[str, Transform]) -> FurtherViews:
-    """The images of the further cameras at the registered viewpoints of the data set.
+    """Return the images of the further cameras at the registered viewpoints of the data set.
 
     Args:
         summary: the run.
@@ -160,7 +160,7 @@ def _view(
 
 
 def _stated(captures: Sequence[ViewpointCaptured], located: Answer) -> dict[str, Any]:
-    """What `dataset.json` says of one further camera."""
+    """Return the entry of `dataset.json` for one further camera."""
     clock = clock_offset(captures, located.device)
     said: dict[str, Any] = {
         "camera": located.device,

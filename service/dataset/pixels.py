@@ -32,7 +32,7 @@ class _Last(Generic[_T]):
         self._kept: tuple[str, _T] | None = None
 
     def of(self, view: PosedView) -> _T:
-        """What belongs to a view; not to be written to."""
+        """Return what was made for a view; it must not be written to."""
         if self._kept is None or self._kept[0] != view.name:
             self._kept = None  # the memory of the last one is free while the next is made
             self._kept = (view.name, self._make(view))
@@ -67,7 +67,7 @@ class Photographs:
         self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
 
     def picture(self, view: PosedView) -> bytes:
-        """The file as the camera wrote it, except what was to be removed or marked."""
+        """Return the file as the camera wrote it, except what was to be removed or marked."""
         try:
             data = self._files[view.name].read_bytes()
         except OSError as error:
@@ -79,23 +79,23 @@ class Photographs:
         return described(data, self._mark, view.name) if self._mark else data
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR."""
+        """Return the colours (H, W, 3), BGR."""
         return self._colours.of(view)
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh."""
+        """Return the depth (H, W), z of the mesh."""
         return depth_map(self._surface, view.camera, view.T_world_camera)
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) normals of the mesh."""
+        """Return the normals (H, W, 3) of the mesh."""
         return seen(self._surface, view.camera, view.T_world_camera).normal
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """(H, W) which pixels the photograph has: all of them."""
+        """Return which pixels (H, W) the photograph has: all of them."""
         return np.ones((view.camera.height, view.camera.width), dtype=np.bool_)
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """(H, W) which pixels show a sphere or a post."""
+        """Return which pixels (H, W) show a sphere or a post."""
         return marker_mask(view.camera, view.T_world_camera, self._spheres, self._posts)
 
 
@@ -109,11 +109,11 @@ class UndistortedViews:
         self._colours = _Last(self._resampled)
 
     def picture(self, view: PosedView) -> bytes:
-        """Resampled, with the photograph's metadata."""
+        """Return the resampled picture, with the photograph's metadata."""
         return _encoded(view, self.colours(view), self._inner.picture(self._sources[view.name]), self._personal)
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR; black where the photograph has no pixel."""
+        """Return the colours (H, W, 3), BGR; black where the photograph has no pixel."""
         return self._colours.of(view)
 
     def _resampled(self, view: PosedView) -> NDArray[np.uint8]:
@@ -121,19 +121,19 @@ class UndistortedViews:
         return undistorted(self._inner.colours(source), source.camera).image
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh for the pinhole."""
+        """Return the depth (H, W), z of the mesh for the pinhole."""
         return self._inner.depth_m(view)
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) normals for the pinhole."""
+        """Return the normals (H, W, 3) for the pinhole."""
         return self._inner.normal(view)
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """Pixels that the photograph has."""
+        """Return which pixels the photograph has, (H, W)."""
         return valid_pixels(self._sources[view.name].camera)
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Spheres and posts for the pinhole."""
+        """Return which pixels show a sphere or a post in the pinhole's picture, (H, W)."""
         return self._inner.markers(view)
 
 
@@ -146,35 +146,35 @@ class Cropped:
         self._originals = _Last(whole.pixels.picture)
 
     def picture(self, view: PosedView) -> bytes:
-        """Cut out and encoded again, with the photograph's metadata."""
+        """Return the picture, cut out and encoded again, with the metadata of the photograph."""
         original = self._originals.of(self._crops[view.name][0])
         return _encoded(view, self.colours(view), original, self._personal)
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR."""
+        """Return the colours (H, W, 3), BGR."""
         source, crop = self._crops[view.name]
         return np.ascontiguousarray(self._inner.colours(source)[crop.slices])
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh."""
+        """Return the depth (H, W), z of the mesh."""
         return self._inner.depth_m(view)
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) normals of the mesh."""
+        """Return the normals (H, W, 3) of the mesh."""
         return self._inner.normal(view)
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """Pixels that the source has."""
+        """Return which pixels the source has, (H, W)."""
         source, crop = self._crops[view.name]
         return self._inner.valid(source)[crop.slices]
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """None: crops are chosen so."""
+        """Return which pixels (H, W) show a marker; none does, as crops are chosen so."""
         return self._inner.markers(view)
 
 
 def undistorted_data_set(dataset: DataSet, *, personal: bool = True) -> DataSet:
-    """The views with pinhole cameras (`pinhole_of`) and resampled pictures; unchanged if no camera has distortion."""
+    """Return the views with pinhole cameras (`pinhole_of`) and resampled pictures; unchanged without distortion."""
     if not any(view.camera.distortion.any() for view in dataset.views):
         return dataset
     views = tuple(dataclasses.replace(view, camera=pinhole_of(view.camera)) for view in dataset.views)
@@ -190,7 +190,7 @@ def cropped_data_set(
     most: int = 1,
     personal: bool = True,
 ) -> DataSet:
-    """Marker-free crops, named `VIEW_crop0`, `VIEW_crop1`, …, with the splits of their views.
+    """Return marker-free crops, named `VIEW_crop0`, `VIEW_crop1`, …, with the splits of their views.
 
     Args:
         dataset: whole images, distorted or not.
@@ -234,7 +234,7 @@ def cropped_data_set(
 
 
 def _encoded(view: PosedView, colours: NDArray[np.uint8], original: bytes, personal: bool) -> bytes:
-    """As PNG, or as JPEG of quality 97 without subsampled colours, with the original's metadata."""
+    """Encode as PNG, or as JPEG of quality 97 without subsampled colours, with the original's metadata."""
     encoded, data = cv2.imencode(view.suffix, colours, _JPEG if view.suffix == ".jpg" else ())
     if not encoded:
         raise DataError("the picture cannot be encoded", where=view.name, remedy="Export originals instead")

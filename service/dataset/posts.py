@@ -1,4 +1,4 @@
-"""The posts of a run's registration spheres, which are not recorded: the scan's board or an arm tells their place."""
+"""The posts of a run's registration spheres, which are not recorded: the scan's board or an arm shows their place."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _LEAST_LEVEL = 0.05  # share of the surface that must be level
 
 @dataclass(frozen=True, slots=True)
 class Posts:
-    """The posts.
+    """The posts of the spheres.
 
     Attributes:
-        cylinders: each as thick as its sphere.
-        words: what is known of them, to follow the number of spheres.
+        cylinders: one for each post, as thick as its sphere.
+        words: a text on what is known of them, to follow the number of spheres.
     """
 
     cylinders: tuple[Cylinder, ...]
@@ -36,14 +36,14 @@ class Posts:
 
 @dataclass(frozen=True, slots=True)
 class _Ground:
-    """What the posts stand on: its unit normal (3,) upwards, and its height along that, in the frame of the scan."""
+    """The plane on which the posts stand: unit normal (3,) upwards, and height along it, in the frame of the scan."""
 
     up: Array
     height_m: float
 
 
 def posts_of(summary: RunSummary, spheres: Sequence[WorldSphere], views: Sequence[PosedView]) -> Posts:
-    """The posts below spheres, along the normal of the board that the scan shows, or the z axis of an arm's base.
+    """Return the posts below spheres, along the normal of the board in the scan, or the z axis of an arm's base.
 
     They end on the board or, if the scan shows none, on the table that the rig file states, on which the board lies.
     """
@@ -68,7 +68,7 @@ def posts_of(summary: RunSummary, spheres: Sequence[WorldSphere], views: Sequenc
 
 
 def _down_to(ground: _Ground, scan: Mesh, spheres: Sequence[WorldSphere]) -> tuple[Cylinder, ...]:
-    """A post below each sphere, down to the ground and at least to the lowest point of the scan."""
+    """Return a post below each sphere, down to the ground and at least to the lowest point of the scan."""
     lowest = min(ground.height_m, float((scan.vertices_m @ ground.up).min()))
     return tuple(
         post
@@ -83,7 +83,7 @@ def _down_to(ground: _Ground, scan: Mesh, spheres: Sequence[WorldSphere]) -> tup
 
 
 def _table(summary: RunSummary) -> _Ground | None:
-    """The table at a station, from the rig file and a registration of an arm's poses; None without either."""
+    """Return the table at a station, from the rig file and a registration of an arm's poses; None without either."""
     registrations = summary.registrations()
     registered = next((registrations[name] for name in reversed(ARM) if name in registrations), None)
     rig = None if registered is None else _rig(summary)
@@ -99,7 +99,7 @@ def _table(summary: RunSummary) -> _Ground | None:
 
 
 def _rig(summary: RunSummary) -> RigSection | None:
-    """The rig of a run; None if it was imported, or if an earlier version wrote what this one cannot read."""
+    """Return the rig of a run; None if it was imported, or if an earlier version wrote what this one cannot read."""
     if summary.root.origin == "imported":
         return None
     recorded = summary.root.rig
@@ -111,7 +111,7 @@ def _rig(summary: RunSummary) -> RigSection | None:
 
 
 def upwards(mesh: Mesh, about: Array) -> Array:
-    """Unit normal (3,) of the board: the direction, within 45° of `about`, to which most of the surface is level.
+    """Return the board's unit normal (3,): the direction within 45° of `about` to which most surface is level.
 
     Zero where no direction has a twentieth of the surface: the mesh shows no board.
     """

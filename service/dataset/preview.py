@@ -31,8 +31,8 @@ def make_preview(summary: RunSummary, folder: Path, progress: Progress) -> Previ
 
     Args:
         summary: the run.
-        folder: made if it is not there; what it holds is replaced.
-        progress: called with the activity, the amount done and the total.
+        folder: the preview's folder; it is made if it is not there, and its content is replaced.
+        progress: a function that is called with the activity, the amount done and the total.
 
     Raises:
         DataError: there is no data set yet, or a photograph cannot be read.
@@ -68,7 +68,7 @@ def make_preview(summary: RunSummary, folder: Path, progress: Progress) -> Previ
 
 
 def _begun(dataset: DataSet, crop: tuple[int, int]) -> Preview:
-    """All views, with the names of the files that they will have."""
+    """Return all views, with the names of the files that they will have."""
     named = dataset.splits.named()
     views = tuple(
         ViewPreview(
@@ -113,7 +113,7 @@ class SmallDepth:
 
 
 def crop_size(dataset: DataSet, wanted: Callable[[PosedView], Mask]) -> tuple[int, int]:
-    """Full HD where that is within the photograph, else a half, a third or a quarter of its sides.
+    """Return the full HD where that is within the photograph, else a half, a third or a quarter of its sides.
 
     The largest that is free of markers in one of three views; the smallest if none is.
 
@@ -134,14 +134,14 @@ def crop_size(dataset: DataSet, wanted: Callable[[PosedView], Mask]) -> tuple[in
 def small_pictures(
     folder: Path, shown: ViewPreview, view: PosedView, pixels: Pixels, crops: Sequence[ImageCrop]
 ) -> tuple[ViewPreview, SmallDepth]:
-    """Write the pictures of a view. Returns the view with what they tell, and its depth.
+    """Write the pictures of a view. Returns the view with what they show, and its depth.
 
     Args:
-        folder: of the preview.
+        folder: the preview's folder.
         shown: the view, whose files are to be written.
-        view: the same in the data set.
-        pixels: of the data set.
-        crops: of the view.
+        view: the same view in the data set.
+        pixels: the pixels of the data set.
+        crops: the crops of the view.
 
     Raises:
         DataError: the photograph cannot be read.
@@ -159,14 +159,14 @@ def small_pictures(
 
 
 def small_camera(camera: CameraModel) -> CameraModel:
-    """The camera of the small picture."""
+    """Return the camera of the small picture."""
     if camera.width <= IMAGE_PX:
         return camera
     return camera.scaled(IMAGE_PX, max(1, round(camera.height * IMAGE_PX / camera.width)))
 
 
 def depth_colours(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> Colours:
-    """(H, W, 4) blue, green, red and opacity: near is yellow, far is violet, no surface is transparent."""
+    """Colour a depth, (H, W, 4) blue, green, red, opacity: near is yellow, far violet, no surface transparent."""
     level = np.clip((far_m - depth_m) / max(far_m - near_m, 1e-9) * 255, 0, 255).astype(np.uint8)
     colours = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
     return np.dstack([colours, np.where(depth_m > 0, 255, 0).astype(np.uint8)])

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 LIST = "preview.json"
 FILE_NAME = re.compile(r"[a-z0-9_-]{1,60}\.(jpg|webp|json)")
-AT_LEAST = (1, 2, 4, 8)  # views, of which the coverage is told
+AT_LEAST = (1, 2, 4, 8)  # numbers of views for which the coverage is reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +30,11 @@ class ViewPreview:
     """A view. Its files are there when `ready`.
 
     Attributes:
-        name: of the view.
-        width, height: of the photograph, px.
-        splits: to which it belongs.
+        name: the view's name.
+        width, height: size of the photograph, px.
+        splits: the splits to which it belongs.
         thumbnail, image, depth: files; the depth is a picture with a transparent ground, as large as the image.
-        near_mm, far_mm: of the surface in it, at the ends of the colours; 0 where none is seen.
+        near_mm, far_mm: depths of the surface in it, at the ends of the colours; 0 where none is seen.
         crops: the best parts first.
     """
 
@@ -72,13 +72,13 @@ class GroundTruthPreview:
     """The mesh that was fused from CT and scan, as its step recorded it.
 
     Attributes:
-        step: title of the step.
-        ct_share, scan_share, blend_share: of the vertices, by what they come from.
-        sigma_median_mm: of the stated standard deviations of the vertices.
-        sigma_high_mm: which 99 % of them do not exceed.
-        distance_change_max_mm: of two spheres, from the CT to the scan: what the transport changed.
+        step: the step's title.
+        ct_share, scan_share, blend_share: shares of the vertices, by what they come from.
+        sigma_median_mm: median of the recorded standard deviations of the vertices.
+        sigma_high_mm: value that 99 % of them do not exceed.
+        distance_change_max_mm: largest change of two spheres' distance from the CT to the scan, by the transport.
         loop_closure_mm: largest way of a sphere from scan to CT and back by the cameras; None without images.
-        faces: of the mesh.
+        faces: number of faces of the mesh.
         regions: corrections of the proposed wound.
         sources, sigmas: files of the mesh, coloured by source and by standard deviation.
     """
@@ -103,13 +103,13 @@ class DistancePreview:
 
     Attributes:
         chamfer_mm: mean of the two directions.
-        ct_to_scan_mm, scan_to_ct_mm: means.
-        ct_to_scan_median_mm, scan_to_ct_median_mm: of the same distances.
-        floor_mm: what the Chamfer distance would be, by the sampling alone, if the surfaces were equal.
+        ct_to_scan_mm, scan_to_ct_mm: mean distances.
+        ct_to_scan_median_mm, scan_to_ct_median_mm: medians of the same distances.
+        floor_mm: Chamfer distance that the sampling alone would cause if the surfaces were equal.
         excluded: share of the samples beyond `outlier_mm`, in no mean; None: the record does not say.
-        outlier_mm, spacing_mm: of the comparison.
-        spheres: by which the two were brought together, and their root mean square distance.
-        spheres_rms_mm: of them.
+        outlier_mm, spacing_mm: settings of the comparison: limit of outliers, and spacing of the samples.
+        spheres: number of spheres by which the two were brought together.
+        spheres_rms_mm: root mean square distance of these spheres.
         figure: file of the scan, coloured by its distance to the CT.
         picture: file of both, seen from above.
         step: title of the step that recorded these figures; "": they were computed for the screen alone.
@@ -136,13 +136,13 @@ class Preview:
     """A data set on the screen, as far as it is ready.
 
     Attributes:
-        views: all of them.
+        views: all views.
         crop: width and height of the crops, px.
-        coverage: None: not yet.
-        ground_truth: None: not yet, or the mesh is the scan's.
-        distances: None: not yet, or `no_distances` says why not.
-        no_distances: reason.
-        whole: nothing more will come.
+        coverage: the views' coverage of the surface; None: not yet.
+        ground_truth: the fused mesh; None: not yet, or the mesh is the scan's.
+        distances: the CT against the scan; None: not yet, or `no_distances` says why not.
+        no_distances: the reason.
+        whole: true when nothing more will come.
     """
 
     views: tuple[ViewPreview, ...]
@@ -163,7 +163,7 @@ def write_preview(folder: Path, preview: Preview) -> None:
 
 
 def read_preview(folder: Path) -> Preview | None:
-    """The list; None if there is none that can be read."""
+    """Return the list; None if there is none that can be read."""
     try:
         return _PREVIEW.validate_json((folder / LIST).read_bytes())
     except (OSError, ValidationError):

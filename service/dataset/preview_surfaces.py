@@ -48,7 +48,7 @@ class VertexFigures:
 
 
 def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_high_mm: float) -> GroundTruthPreview:
-    """The figures of a fusion as it was recorded, with the names of the files of its two coloured meshes."""
+    """Return the figures of a fusion as it was recorded, with the names of the files of its two coloured meshes."""
     measures = fusion.measures
     return GroundTruthPreview(
         step=fusion.step,
@@ -67,11 +67,11 @@ def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_
 
 
 def vertex_figures(path: Path, points_m: Array) -> tuple[VertexFigures, float]:
-    """Source and sigma at points (V, 3) of the mesh, each that of the nearest vertex; and a high sigma, in mm.
+    """Return source and sigma at points (V, 3) of the mesh, those of the nearest vertices, and a high sigma, mm.
 
     Args:
-        path: of the recorded mesh, a PLY in millimetres with `source` and `sigma_mm` at each vertex.
-        points_m: of a simplified mesh in the same frame.
+        path: file of the recorded mesh, a PLY in millimetres with `source` and `sigma_mm` at each vertex.
+        points_m: (V, 3) points of a simplified mesh in the same frame.
 
     Raises:
         DataError: it has no such properties.
@@ -108,7 +108,7 @@ class SimplifiedMesh:
 
     @classmethod
     def of(cls, mesh: Mesh) -> SimplifiedMesh:
-        """About as many triangles as a browser draws smoothly."""
+        """Simplify a mesh to about as many triangles as a browser draws smoothly."""
         return cls(*decimated(mesh.vertices_m, mesh.faces))
 
 
@@ -134,7 +134,7 @@ def fused_mesh(folder: Path, summary: RunSummary, fusion: RecordedFusion, mesh: 
 
 
 def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | None) -> DistancePreview:
-    """How far CT and scan are from each other, and the scan coloured by it.
+    """Return how far CT and scan are from each other, and the scan coloured by it.
 
     The figures and the picture are those that the fusion recorded. Without a fusion, CT and scan are brought together
     by their spheres and compared here, for the screen alone.
@@ -177,7 +177,7 @@ def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | 
 
 
 def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> DistancePreview:
-    """CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
+    """Return CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
     found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
     if found is None:
         raise DataError("the run has no CT", where=summary.run_id)
@@ -223,7 +223,7 @@ def _put_picture(folder: Path, picture: NDArray[np.uint8]) -> str:
 
 
 def _scene(summary: RunSummary, mesh: SimplifiedMesh, colours: MeshColours, poses: dict[str, Transform]) -> Scene:
-    """The coloured mesh with its spheres, and cameras if there are poses."""
+    """Return the coloured mesh with its spheres, and cameras if there are poses."""
     centres = summary.scan_spheres_m()
     spheres = [SceneSphere(str(k), "registration", centre) for k, centre in enumerate(centres)]
     shown = SceneMesh(mesh.points_m, mesh.triangles, colours=colours)
@@ -232,7 +232,7 @@ def _scene(summary: RunSummary, mesh: SimplifiedMesh, colours: MeshColours, pose
 
 
 def _up(summary: RunSummary) -> tuple[float, float, float] | None:
-    """From the spheres to the cameras of the run's own registration; the axes of a scan point anywhere."""
+    """Return the way from the spheres to the cameras of the run's own registration; a scan's axes point anywhere."""
     own = summary.best()
     if own is None:
         return None

@@ -24,9 +24,9 @@ NOT_STATED = "not stated"
 
 @dataclass(frozen=True, slots=True)
 class UsedDevice:
-    """A device as it stated itself when it was opened; "" for what it did not state or what is left out."""
+    """A device as it identified itself when it was opened; "" for what it did not report or what is left out."""
 
-    name: str  # in rig.yaml
+    name: str  # the name in rig.yaml
     model: str
     serial: str
     firmware: str
@@ -38,31 +38,31 @@ class About:
 
     Attributes:
         stated: title, licence, ethics, creators and citation, from the protocol or the export's options.
-        version: of the data set.
-        run: identifier of the run.
-        protocol: its id, version and SHA-256.
-        protocol_title: in words.
-        source: where the procedure comes from.
-        specimen: as entered at the start of the run.
-        purpose: likewise.
-        site: likewise.
-        origin: how the photographs came into the run, a sentence.
+        version: the data set's version.
+        run: the run's identifier.
+        protocol: the protocol's id, version and SHA-256.
+        protocol_title: the protocol's title.
+        source: the origin of the procedure.
+        specimen: the specimen, as entered at the start of the run.
+        purpose: the purpose, likewise.
+        site: the site, likewise.
+        origin: a sentence on how the photographs came into the run.
         published_utc: time of the last event that the data set rests on.
         head_sha256: hash of that event.
         software: version of this program.
-        people: who took part; empty if personal data are left out.
-        devices: that were opened.
-        settings: of the camera and of the spheres, (name, value) in words.
+        people: accounts of those who took part; empty if personal data are left out.
+        devices: the devices that were opened.
+        settings: settings of the camera and of the spheres, (name, value) as text.
         accuracy: the run's own registration in the evaluation's table; None if there is none.
-        budget: of its error.
-        covariance: what the covariances of the poses hold, a sentence.
-        mesh: what the ground-truth mesh is, a sentence.
-        masks: what the masks hold.
-        fusion: how CT and scan agree and were fused, (name, value) in words; empty if the mesh is the scan.
-        gates: verdicts in words, by step.
-        accepted: gates accepted outside their limits, in words.
-        deviations: from the protocol, in words.
-        later: results that arrived after the evaluation, in words.
+        budget: the budget of its error.
+        covariance: a sentence on what the covariances of the poses hold.
+        mesh: a sentence on what the ground-truth mesh is.
+        masks: a text on what the masks hold.
+        fusion: (name, value) texts on how CT and scan agree and were fused; empty if the mesh is the scan.
+        gates: verdicts as text, by step.
+        accepted: gates accepted outside their limits, as text.
+        deviations: deviations from the protocol, as text.
+        later: results that arrived after the evaluation, as text.
         not_in_yet: results that had not arrived.
     """
 
@@ -96,18 +96,18 @@ class About:
 
     @property
     def title(self) -> str:
-        """The title that was stated; else the protocol's, and the specimen."""
+        """The title that was given; else the protocol's, and the specimen."""
         known = [self.protocol_title or "Posed images and a surface mesh", self.specimen]
         return self.stated.title or ": ".join(filter(None, known))
 
     @property
     def licence(self) -> str:
-        """The licence in words."""
+        """The text of the licence."""
         return self.stated.licence or "No licence was stated: ask the site that made the data set"
 
     @property
     def licence_address(self) -> str:
-        """The address of the licence; "" where none was stated, or one in words as old protocols have it."""
+        """The address of the licence; "" where none was given, or a text as old protocols have it."""
         try:
             return licence_address(self.stated.licence)
         except DataError:
@@ -115,28 +115,28 @@ class About:
 
     @property
     def ethics(self) -> str:
-        """The ethics statement in words."""
+        """The text of the ethics statement."""
         return self.stated.ethics or "No ethics statement was given, neither in the protocol nor at the export"
 
     @property
     def creators(self) -> tuple[Party, ...]:
-        """Who made the data set: as stated, else the site."""
+        """The makers of the data set: those given, else the site."""
         site = (Party(self.site, "Organization"),) if self.site else ()
         return tuple(_party(name) for name in self.stated.creators) or site
 
     @property
     def publisher(self) -> Party | None:
-        """Who publishes it, if that was stated."""
+        """The publisher of the data set, if one was given."""
         return _party(self.stated.publisher, "Organization") if self.stated.publisher else None
 
     @property
     def funders(self) -> tuple[Party, ...]:
-        """Who paid for it."""
+        """The funders of the data set."""
         return tuple(_party(name, "Organization") for name in self.stated.funders)
 
     @property
     def doi(self) -> str:
-        """The address of the data set's DOI, if it was stated and is one."""
+        """The address of the data set's DOI, if it was given and is one."""
         try:
             return doi_address(self.stated.doi)
         except DataError:
@@ -144,7 +144,7 @@ class About:
 
     @property
     def citation(self) -> str:
-        """How to cite it: as stated, else put together from the record."""
+        """The citation: the given one, else one put together from the record."""
         if self.stated.cite:
             return self.stated.cite
         names = ", ".join(maker.name for maker in self.creators)
@@ -155,7 +155,7 @@ class About:
 
 
 def _party(text: str, otherwise: Literal["Person", "Organization", ""] = "") -> Party:
-    """A stated person or body; one that an older record has in a wrong form is named as it stands there."""
+    """Return a given person or body; one that an older record has in a wrong format is named as it stands there."""
     try:
         return party(text, otherwise=otherwise)
     except DataError:
@@ -167,12 +167,12 @@ SIMULATED = "SIMULATED: made by a simulated rig, not by a camera in front of a s
 
 @dataclass(frozen=True, slots=True)
 class PosedView:
-    """One image.
+    """An image of the data set with its camera and pose.
 
     Attributes:
-        name: without suffix; unique, of letters, digits, `_`, `-` and `.`.
-        suffix: of its picture file, `.jpg` or `.png`.
-        camera: at the size of the picture; pixel centres at integer coordinates.
+        name: the view's unique name without suffix, of letters, digits, `_`, `-` and `.`.
+        suffix: suffix of its picture file, `.jpg` or `.png`.
+        camera: the camera at the size of the picture; pixel centres are at integer coordinates.
         T_world_camera: (4, 4) m; x right, y down, z forward.
         covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
         taken: time that the photograph states, as EXIF has it; "" if it states none.
@@ -201,7 +201,7 @@ class Mesh:
         vertices_m: (V, 3) in the world frame.
         faces: (F, 3).
         source: (V,) where each vertex comes from, 0: CT, 1: scan, 2: blend; None: all from the scan.
-        sigma_m: (V,) stated standard deviation along the normal; None: not stated.
+        sigma_m: (V,) standard deviation along the normal; None: not known.
     """
 
     vertices_m: Array
@@ -219,30 +219,30 @@ class ScanFile:
 
 
 class Pixels(Interface):
-    """What belongs to the pixels of a view; read or computed at each call, at the size of `view.camera`."""
+    """The pixel data of a view; read or computed at each call, at the size of `view.camera`."""
 
     def picture(self, view: PosedView) -> bytes:
-        """The JPEG or PNG file. Raises DataError if it cannot be read."""
+        """Return the JPEG or PNG file. Raises DataError if it cannot be read."""
         ...
 
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR of the picture. Raises DataError if it cannot be read."""
+        """Return the colours (H, W, 3) of the picture, BGR. Raises DataError if it cannot be read."""
         ...
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) z of the mesh in the camera frame, m; 0 where none is seen."""
+        """Return the depth (H, W), z of the mesh in the camera frame, m; 0 where none is seen."""
         ...
 
     def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W, 3) unit normals of the mesh in the camera frame, towards the camera; 0 where none is seen."""
+        """Return unit normals (H, W, 3) of the mesh in the camera frame, towards the camera; 0 where none is seen."""
         ...
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """(H, W) pixels that the picture has; others are outside the photograph that was resampled."""
+        """Return which pixels (H, W) the picture has; others are outside the photograph that was resampled."""
         ...
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """(H, W) pixels that a sphere or post covers."""
+        """Return which pixels (H, W) a sphere or post covers."""
         ...
 
 
@@ -254,12 +254,12 @@ class DataSet:
         identity: differs where anything exported differs; an interrupted export goes on only with the same.
         simulated: nothing of it was measured.
         statement: JSON data on origin, devices, gates and deviations, for `dataset.json`.
-        views: in order of their names.
-        pixels: of the views.
+        views: the views in order of their names.
+        pixels: the views' pixels.
         mesh: ground truth in the world frame.
-        splits: of the names of the views.
+        splits: the splits of the views, by name.
         pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance. Errors that
-            are common to all views may be missing: they cancel in relative poses. None where it is not stated.
+            are common to all views may be missing: they cancel in relative poses. None where it is not known.
         about: the data set as a whole, for its data card and metadata.
         scan_files: the scanner's own export, with its textures.
     """
@@ -281,14 +281,14 @@ class DataSet:
         return SIMULATED if self.simulated else ""
 
     def errors_of(self, views: Sequence[int]) -> Array | None:
-        """(6 N, 6 N) `pose_errors` of the views with these numbers, which may repeat."""
+        """Return (6 N, 6 N) `pose_errors` of the views with these numbers, which may repeat."""
         if self.pose_errors is None:
             return None
         rows = (6 * np.array(views, dtype=np.int64)[:, None] + np.arange(6)).ravel()
         return self.pose_errors[np.ix_(rows, rows)]
 
     def keeping(self, names: tuple[str, ...]) -> DataSet:
-        """This data set with only these views, also in its splits."""
+        """Return this data set with only these views, also in its splits."""
         chosen = set(names)
         cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
         kept = [k for k, view in enumerate(self.views) if view.name in chosen]
@@ -307,7 +307,7 @@ class DataSet:
 
 
 def only_camera(dataset: DataSet, of: str) -> CameraModel:
-    """The camera of all views, for a format that has one.
+    """Return the camera of all views, for a format that has one.
 
     Raises:
         DataError: there is no view, or the views have several cameras.

@@ -28,7 +28,7 @@ _R = TypeVar("_R", bound=JobRecord)
 
 
 def last_result(protocol: Protocol, state: RunState, gives: Gives, record: type[_R]) -> _R | None:
-    """The result of the last step that gives this and has one, read as `record`; None if there is none.
+    """Return the result of the last step that gives this and has one, read as `record`; None if there is none.
 
     Raises:
         IntegrityError: the recorded result is not such a record.
@@ -39,7 +39,7 @@ def last_result(protocol: Protocol, state: RunState, gives: Gives, record: type[
 
 
 def result_of_step(state: RunState, step: str, record: type[_R]) -> _R:
-    """The result of a step, read as `record`. Raises IntegrityError where it is not such a record."""
+    """Return the result of a step, read as `record`. Raises IntegrityError where it is not such a record."""
     try:
         return record.model_validate(state.steps[step].result)
     except ValidationError as error:
@@ -49,14 +49,14 @@ def result_of_step(state: RunState, step: str, record: type[_R]) -> _R:
 
 
 def registration_name(record: Registration) -> str:
-    """The name of a registration record: `colmap`, or `colmap_1920x1080` for images reduced to that size."""
+    """Return the name of a registration record: `colmap`, or `colmap_1920x1080` for images reduced to that size."""
     if record.full_camera is None:
         return record.poses
     return f"{record.poses}_{record.camera.width}x{record.camera.height}"
 
 
 def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration]:
-    """Every registration record by its name: those in the step's result, then those that arrived later."""
+    """Return every registration record by its name: those in the step's result, then those that arrived later."""
     result = last_result(protocol, state, "registrations", Registrations)
     found = {} if result is None else dict(result.registrations)
     for _, job in _finished(protocol, state, "registrations", register.KIND.name) if found else ():
@@ -66,13 +66,13 @@ def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration
 
 
 def further_cameras(protocol: Protocol, state: RunState) -> dict[str, further_camera.Answer]:
-    """The further cameras of the rig by their names, as the registration step located them."""
+    """Return the further cameras of the rig by their names, as the registration step located them."""
     result = last_result(protocol, state, "registrations", Registrations)
     return {} if result is None else dict(result.cameras)
 
 
 def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
-    """All rows of the paper's table; `late` says when a late row arrived, and is "" for a row of the evaluation."""
+    """Return all rows of the paper's table; `late` says when a late row arrived, "" for a row of the evaluation."""
     rows = [row.model_copy(update={"late": ""}) for row in signed_rows(protocol, state)]
     known = {row.poses for row in rows}
     for _, job in later_evaluations(protocol, state) if rows else ():
@@ -84,12 +84,12 @@ def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
 
 
 def arrived(protocol: Protocol, state: RunState, job: JobState) -> str:
-    """`arrived 12 min after the specimen was freed`, or `arrived after the evaluation` if it was not freed yet."""
+    """Say `arrived 12 min after the specimen was freed`, or `arrived after the evaluation` if that came first."""
     return "arrived after the evaluation" if job.late_s is None else late_words(protocol, state, job.late_s)
 
 
 def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
-    """A note that some rows share one adjustment, so their agreement confirms nothing; "" without two such rows.
+    """Return a note that some rows share one adjustment, so that their agreement confirms nothing; "" without two.
 
     Incremental mapping, global mapping and triangulation each give initial poses from part of the tracks; the final
     model is one bundle adjustment of all tracks from there (service/compute/sfm/child.py).
@@ -128,7 +128,7 @@ def _sizes(rows: Iterable[Row]) -> list[str]:
 
 
 def budgets(protocol: Protocol, state: RunState) -> dict[str, ErrorBudget]:
-    """The error budget of each registration, by its name."""
+    """Return the error budget of each registration, by its name."""
     result = last_result(protocol, state, "accuracy", evaluate.Answer)
     found = {} if result is None else result.budgets
     for _, job in later_evaluations(protocol, state):
@@ -137,13 +137,13 @@ def budgets(protocol: Protocol, state: RunState) -> dict[str, ErrorBudget]:
 
 
 def own_registration(protocol: Protocol, state: RunState) -> str | None:
-    """The name of the run's own registration (see the module's docstring); None before the evaluation."""
+    """Return the name of the run's own registration (see the module's docstring); None before the evaluation."""
     rows = signed_rows(protocol, state)
     return best_row(rows).poses if rows else None
 
 
 def best_registration(protocol: Protocol, state: RunState) -> str | None:
-    """The name of the registration to show: the run's own; before the evaluation, the most certain one.
+    """Return the name of the registration to show: the run's own; before the evaluation, the most certain one.
 
     Reduced resolutions are for comparison; before the evaluation they are not shown. None where there is none.
     """
@@ -155,12 +155,12 @@ def best_registration(protocol: Protocol, state: RunState) -> str | None:
 
 
 def best_row(rows: Sequence[Row]) -> Row:
-    """The row of an evaluation's table with the smallest error on the control spheres; of equal ones the first."""
+    """Return the row of an evaluation's table with the smallest error on control spheres; of equal ones the first."""
     return min(rows, key=_error_mm)
 
 
 def better_later(protocol: Protocol, state: RunState) -> Row | None:
-    """The table's best row if it arrived after the evaluation and is better than the run's own; else None."""
+    """Return the table's best row if it arrived after the evaluation and is better than the run's own; else None."""
     own = own_registration(protocol, state)
     rows = evaluated(protocol, state)
     best = best_row(rows) if rows else None
@@ -169,7 +169,7 @@ def better_later(protocol: Protocol, state: RunState) -> Row | None:
 
 
 def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
-    """The rows of the table that the evaluation step made: those that were judged and signed."""
+    """Return the rows of the table that the evaluation step made: those that were judged and signed."""
     result = last_result(protocol, state, "accuracy", evaluate.Answer)
     return [] if result is None else list(result.table)
 
@@ -179,12 +179,12 @@ def _error_mm(row: Row) -> float:
 
 
 def _predicted_m2(record: Registration) -> float:
-    """Variance of the position that a registration states of itself, over all three axes."""
+    """Return the variance of the position that a registration states of itself, over all three axes."""
     return float(sum(record.covariance[axis][axis] for axis in range(3)))
 
 
 def later_evaluations(protocol: Protocol, state: RunState) -> list[tuple[str, JobState]]:
-    """(step, job) of every evaluation of a registration that arrived after the evaluation step's own."""
+    """Return (step, job) of every evaluation of a registration that arrived after the evaluation step's own."""
     jobs = _finished(protocol, state, "accuracy", evaluate.KIND.name)
     return [(step, job) for step, job in jobs if lane_of(job.priority) == "background"]
 
@@ -206,15 +206,15 @@ def _finished(protocol: Protocol, state: RunState, gives: Gives, job_kind: str) 
 class LateResult:
     """One row of the evaluation's table that arrived after the evaluation was made."""
 
-    seq: int  # of the event that brought it
+    seq: int  # number of the event that brought it
     at_utc: str
     step: str
-    name: str  # of the registration
+    name: str  # the registration's name
     text: str
 
 
 def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
-    """Every late result of a run, in order of arrival; empty before the evaluation."""
+    """Return every late result of a run, in order of arrival; empty before the evaluation."""
     own = own_registration(protocol, state)
     before = signed_rows(protocol, state)
     if own is None:

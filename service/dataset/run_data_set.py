@@ -44,7 +44,7 @@ def data_set_of(
     stated: DataSetStatement | None = None,
     version: str = FIRST_VERSION,
 ) -> DataSet:
-    """Images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
+    """Return images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
 
     The poses are those of the run's own registration, with the camera that it was made with. Images that were taken
     for the evaluation alone are left out. Control spheres are masked in all images: they were taken away before the
@@ -52,11 +52,11 @@ def data_set_of(
 
     Args:
         summary: the run.
-        not_in_yet: results that have not arrived yet, in words.
+        not_in_yet: texts on results that have not arrived yet.
         personal: False leaves GPS, owner and serial numbers out of the pictures, people and serial numbers out of
             the metadata, and the scanner's own files, which may state anything, out altogether.
         stated: title, licence, ethics, creators and citation; they replace those of the protocol.
-        version: of the data set.
+        version: the data set's version.
 
     Raises:
         DataError: the run has no evaluated registration, no scan, or no registered image.
@@ -103,12 +103,12 @@ def data_set_of(
 
 
 def specimen_pixels(summary: RunSummary, view: PosedView) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """(H, W) pixels between the spheres, which stand around the specimen."""
+    """Return which pixels (H, W) lie between the spheres, which stand around the specimen."""
     return hull_mask(view.camera, view.T_world_camera, np.array(summary.scan_spheres_m()))
 
 
 def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple[Path, str]]]:
-    """The run's own registration with its name, and its images.
+    """Return the run's own registration with its name, and its images.
 
     Raises:
         DataError: there is none, no scan, or no image.
@@ -128,7 +128,7 @@ def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple
 def _pixels(
     summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[PosedView], mesh: Mesh, *, personal: bool
 ) -> tuple[Photographs, str]:
-    """Photographs, depth and masks of the views, and what the masks hold, in words."""
+    """Return photographs, depth and masks of the views, and a text on what the masks hold."""
     standing, others = _spheres(summary)
     posts = posts_of(summary, standing, views)
     pixels = Photographs(
@@ -143,7 +143,7 @@ def _pixels(
 
 
 def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
-    """File and hash of each registered image, by viewpoint."""
+    """Return the file and hash of each registered image, by viewpoint."""
     found: dict[str, tuple[Path, str]] = {}
     for capture in summary.captures():
         photograph = capture.artefacts[0]
@@ -159,7 +159,7 @@ def _further_view(one: FurtherView, covariance: Array) -> PosedView:
 
 
 def _in_order(views: Sequence[PosedView]) -> tuple[PosedView, ...]:
-    """The views in order of their names. Raises DataError if two have the same name."""
+    """Return the views in order of their names. Raises DataError if two have the same name."""
     ordered = tuple(sorted(views, key=lambda view: view.name))
     for one, other in pairwise(ordered):
         if one.name == other.name:
@@ -180,7 +180,7 @@ def _view(name: str, path: Path, registered: Registration, covariance: Array, ta
 
 
 def _spheres(summary: RunSummary) -> tuple[tuple[WorldSphere, ...], tuple[WorldSphere, ...]]:
-    """The registration spheres, and the others that an image may show."""
+    """Return the registration spheres, and the others that an image may show."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
     standing, others = (
         tuple(WorldSphere(np.array(centre), radius_m) for centre in centres)
@@ -190,7 +190,7 @@ def _spheres(summary: RunSummary) -> tuple[tuple[WorldSphere, ...], tuple[WorldS
 
 
 def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
-    """Centres of the control spheres, which the images show and the scan does not."""
+    """Return centres of the control spheres, which the images show and the scan does not."""
     before = control_scan(summary.protocol)
     if not before or not summary.state.steps[before].result:
         return ()
@@ -198,7 +198,7 @@ def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ..
 
 
 def _sees(view: PosedView, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which of some vertices of the mesh are within the image."""
+    """Return which of some vertices of the mesh are within the image."""
     points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
     camera = view.camera
     before = apply(inverse(view.T_world_camera), points)
@@ -218,7 +218,7 @@ _REFERRING = (".obj", ".mtl", ".ply")
 
 
 def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
-    """The original files of the registered scan, under the names by which they refer to each other.
+    """Return the original files of the registered scan, under the names by which they refer to each other.
 
     Recorded files have lost their folders and may differ in case; a mesh finds its materials, and these find their
     textures, only under the names that are written in them.
@@ -226,7 +226,7 @@ def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
     step = registered_scan(summary.protocol, summary.state)
     kept = summary.state.steps[step].artefacts if step else ()
     refs = [ref for ref in kept if ref.kind == "scan_mesh_original"]
-    named: dict[str, str] = {}  # by the last part of the name, in lower case and with accents composed
+    named: dict[str, str] = {}  # full names by the last part of the name, in lower case and with accents composed
     for ref in refs:
         if ref.original_name.lower().endswith(_REFERRING):
             with summary.store.artefact_path(ref.sha256).open("rb") as file:

@@ -21,7 +21,7 @@ _ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
 def frustum_lines(cameras: Sequence[Transform]) -> Array:
-    """Line segments (N, 3) in mm that draw each camera as a small pyramid, separated by NaN rows."""
+    """Return line segments (N, 3) in mm that draw each camera as a small pyramid, separated by NaN rows."""
     w, h, z = 0.36 * _FRUSTUM_MM, 0.24 * _FRUSTUM_MM, _FRUSTUM_MM
     o, a, b, c, d = [0, 0, 0], [-w, -h, z], [w, -h, z], [w, h, z], [-w, h, z]
     path = metres(np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64))
@@ -30,7 +30,7 @@ def frustum_lines(cameras: Sequence[Transform]) -> Array:
 
 
 def unit_ball() -> tuple[Array, NDArray[np.int64]]:
-    """A unit sphere: points (V, 3), triangles (F, 3)."""
+    """Return a unit sphere: points (V, 3), triangles (F, 3)."""
     polar = np.linspace(0, np.pi, _FLAT + 1)[1:-1]
     around = np.linspace(0, 2 * np.pi, _ROUND, endpoint=False)
     rings = [[np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)] for p in polar for a in around]
@@ -69,11 +69,11 @@ class SceneSphere:
 
 @dataclass(frozen=True, slots=True)
 class MeshColours:
-    """What a surface is coloured by.
+    """The values that a surface is coloured by.
 
     Attributes:
-        values: (V,), of each vertex; with classes, their indices.
-        title: what they are.
+        values: (V,) the value of each vertex; with classes, their indices.
+        title: the title of the values.
         hover: plotly's template of the text at a vertex; "" for none.
         classes: name and colour of each class; empty for values on a scale.
     """
@@ -102,7 +102,7 @@ class SceneMesh:
 
     @property
     def coloured_by(self) -> MeshColours | None:
-        """What the surface is coloured by; None if it has one colour."""
+        """The values that the surface is coloured by; None if it has one colour."""
         if self.colours is not None or self.error_mm is None:
             return self.colours
         return MeshColours(self.error_mm, "predicted error (mm)", "%{intensity:.4f} mm")
@@ -135,7 +135,7 @@ class Scene:
 
 
 def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[Array, NDArray[np.int64]]:
-    """Points (V, 3) in metres and triangles (F, 3), reduced to about `most` triangles."""
+    """Return points (V, 3) in metres and triangles (F, 3), reduced to about `most` triangles."""
     share = 1.0 - min(1.0, most / max(len(faces), 1))
     points, triangles = np.asarray(vertices_m, dtype=np.float64), np.asarray(faces).astype(np.int64)
     if share > 0:
@@ -146,7 +146,7 @@ def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[A
 
 
 def viewing_frame(scene: Scene) -> Transform:
-    """T_view_frame: origin at the spheres' centre, z up, −y towards the first station.
+    """Return T_view_frame: origin at the spheres' centre, z up, −y towards the first station.
 
     The scan's frame is arbitrary, so the cameras define up unless the scene does.
     """
@@ -164,7 +164,7 @@ def viewing_frame(scene: Scene) -> Transform:
 
 
 def scene_json(scene: Scene) -> str:
-    """The figure as plotly's JSON, in millimetres of the viewing frame; escaped for a script element.
+    """Return the figure as plotly's JSON, in millimetres of the viewing frame; escaped for a script element.
 
     plotly places its camera relative to the box of the axes: the box is scaled to one unit per metre.
     """
@@ -220,7 +220,7 @@ class _Extent:
             )
 
     def ranges(self) -> list[list[float]]:
-        """Low and high end of each axis, mm, with a margin for markers."""
+        """Return the low and high end of each axis, mm, with a margin for markers."""
         if not np.all(np.isfinite(self._low)):
             return [[-500.0, 500.0]] * 3
         return [[float(a) - _ROOM_MM, float(b) + _ROOM_MM] for a, b in zip(self._low, self._high, strict=True)]
@@ -252,7 +252,7 @@ def _mesh(points: Array, mesh: SceneMesh) -> dict[str, object]:
 
 
 def _by_class(mesh: SceneMesh, colours: MeshColours, bar: Mapping[str, object]) -> dict[str, object]:
-    """One colour for each triangle, that of its first corner: between two classes there is nothing."""
+    """Return one colour for each triangle, that of its first corner: between two classes there is nothing."""
     n = len(colours.classes)
     steps = [[(k + end) / n, colour] for k, (_, colour) in enumerate(colours.classes) for end in (0, 1)]
     names = {"tickvals": list(range(n)), "ticktext": [name for name, _ in colours.classes]}
@@ -313,7 +313,7 @@ def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol
 def _frusta(
     poses: Mapping[str, Transform], title: str, colour: str, symbol: str, opacity: float = 1.0
 ) -> list[dict[str, object]]:
-    """Cameras as small pyramids in the viewing frame, with a mark at each projection centre."""
+    """Return cameras as small pyramids in the viewing frame, with a mark at each projection centre."""
     line = {"color": colour, "width": 3}
     frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
     eyes = mm(np.array([T[:3, 3] for T in poses.values()]))
@@ -376,7 +376,7 @@ def _layout(extent: _Extent, *, near: bool) -> dict[str, object]:
 
 
 def _in_box(ranges: Mapping[str, Sequence[float]], point_mm: Sequence[float]) -> dict[str, float]:
-    """A point of the viewing frame in the coordinates of plotly's camera."""
+    """Return a point of the viewing frame in the coordinates of plotly's camera."""
     return {a: metres(p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
 
 
@@ -385,7 +385,7 @@ def _xyz(points: Array) -> dict[str, object]:
 
 
 def _packed(values: NDArray[Any]) -> dict[str, str]:
-    """A typed array in base64, in plotly's format."""
+    """Return a typed array in base64, in plotly's format."""
     kind = "f4" if values.dtype.kind == "f" else "u4"
     little = values.astype(np.dtype(f"<{kind}"))
     return {"dtype": kind, "bdata": base64.b64encode(little.tobytes()).decode()}

@@ -36,7 +36,7 @@ from service.store.store import Store
 
 
 def registered_scan(protocol: Protocol, state: RunState) -> str:
-    """The step whose scan the last registration used; before there is one, the last scan; "" without any."""
+    """Return the step whose scan the last registration used; before there is one, the last scan; "" without any."""
     scans = [step.id for step in reversed(protocol.steps) if step.gives == "scan_surface"]
     for step in reversed(protocol.steps):
         if step.gives == "registrations" and state.steps[step.id].result:
@@ -46,7 +46,7 @@ def registered_scan(protocol: Protocol, state: RunState) -> str:
 
 
 def control_scan(protocol: Protocol) -> str:
-    """The step whose scan still shows the control spheres, as the last evaluation names it; "" without any."""
+    """Return the step whose scan still shows the control spheres, as the last evaluation names it; "" without any."""
     judged = next((step for step in reversed(protocol.steps) if step.gives == "accuracy"), None)
     return "" if judged is None else str(judged.params.model_dump().get("control_scan") or "")
 
@@ -55,7 +55,10 @@ class ArtefactReader(Interface):
     """Finds the files of the evidence."""
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """Path of an artefact's read-only file. Raises IntegrityError if missing or, with `verify`, if altered."""
+        """Return the path of an artefact's read-only file.
+
+        Raises IntegrityError if missing or, with `verify`, if altered.
+        """
         ...
 
 
@@ -64,11 +67,11 @@ class GroundTruth:
     """The mesh of the data set.
 
     Attributes:
-        words: what it is.
-        sha256: of its file.
-        vertices_m: (V, 3).
-        faces: (F, 3).
-        source, sigma_m: (V,) of each vertex, as the fusion stated them; None for a scan.
+        words: a text on what it is.
+        sha256: hash of its file.
+        vertices_m: (V, 3) the vertices in the frame of the scan.
+        faces: (F, 3) indices of the vertices of each face.
+        source, sigma_m: (V,) source and standard deviation of each vertex, as the fusion gave them; None for a scan.
     """
 
     words: str
@@ -91,15 +94,15 @@ class RunSummary:
     store: ArtefactReader
 
     def registrations(self) -> Mapping[str, Registration]:
-        """Registrations by name, including those that arrived after the step's decision."""
+        """Return registrations by name, including those that arrived after the step's decision."""
         return registrations(self.protocol, self.state)
 
     def table(self) -> Sequence[Row]:
-        """The paper's table: control sphere errors for each source of poses, including late arrivals."""
+        """Return the paper's table: control sphere errors for each source of poses, including late arrivals."""
         return evaluated(self.protocol, self.state)
 
     def budgets(self) -> Mapping[str, ErrorBudget]:
-        """The error budget of each evaluated registration."""
+        """Return the error budget of each evaluated registration."""
         return budgets(self.protocol, self.state)
 
     def best(self) -> str | None:
@@ -107,38 +110,41 @@ class RunSummary:
         return own_registration(self.protocol, self.state)
 
     def better_later(self) -> Row | None:
-        """The row of a registration that arrived after the evaluation and beats the run's own, if any."""
+        """Return the row of a registration that arrived after the evaluation and beats the run's own, if any."""
         return better_later(self.protocol, self.state)
 
     def captures(self) -> Iterable[RecordedView]:
-        """Every valid capture in order, including those for calibration."""
+        """Yield every valid capture in order, including those for calibration."""
         seqs = sorted(seq for step in self.state.steps.values() for seq in step.captured.values())
         payloads = (self.events[seq - 1].payload for seq in seqs)
         return (payload for payload in payloads if isinstance(payload, RecordedView))
 
     def artefacts(self, kind: str) -> tuple[ArtefactRef, ...]:
-        """Artefacts of a kind in the results of the run's valid steps."""
+        """Return artefacts of a kind in the results of the run's valid steps."""
         refs = (ref for s in self.protocol.steps for ref in self.state.steps[s.id].artefacts)
         return tuple(ref for ref in refs if ref.kind == kind)
 
     def jobs(self) -> Sequence[JobFinished]:
-        """All finished jobs."""
+        """Return all finished jobs."""
         return [event.payload for event in self.events if isinstance(event.payload, JobFinished)]
 
     def scan_spheres_m(self) -> tuple[Point, ...]:
-        """Sphere centres of the registered scan in its own frame; empty before a scan was imported."""
+        """Return sphere centres of the registered scan in its own frame; empty before a scan was imported."""
         step = registered_scan(self.protocol, self.state)
         known = step and self.state.steps[step].result
         return result_of_step(self.state, step, SpheresFound).spheres_m if known else ()
 
     def scan_mesh_file(self) -> ArtefactRef | None:
-        """The file of the registered scan's mesh; None before it was imported."""
+        """Return the file of the registered scan's mesh; None before it was imported."""
         step = registered_scan(self.protocol, self.state)
         kept = self.state.steps[step].artefacts if step else ()
         return next((ref for ref in reversed(kept) if ref.kind == "scan_mesh"), None)
 
     def scan_mesh(self) -> tuple[Array, Any]:
-        """Vertices (V, 3) in metres and faces (F, 3) of the registered scan. Raises DataError if there is none."""
+        """Return vertices (V, 3) in metres and faces (F, 3) of the registered scan.
+
+        Raises DataError if there is none.
+        """
         ref = self.scan_mesh_file()
         if ref is None:
             raise DataError("the run has no scan", where=self.run_id, remedy="Import the scan")
@@ -146,7 +152,7 @@ class RunSummary:
             return mesh["vertices_m"], mesh["faces"]
 
     def ground_truth(self) -> GroundTruth:
-        """The mesh of the data set, in the scan's frame: CT and scan fused if the run has that, else the scan."""
+        """Return the data set's mesh, in the scan's frame: CT and scan fused if the run has that, else the scan."""
         fused = self.artefacts("ground_truth_mesh")
         if not fused:
             vertices_m, faces = self.scan_mesh()
@@ -172,13 +178,13 @@ MESH = "ground_truth_mesh"  # kind of the mesh's artefact
 
 @dataclass(frozen=True, slots=True)
 class RecordedFusion:
-    """What the record says of the fusion from which the data set's mesh comes.
+    """The recorded fusion from which the data set's mesh comes.
 
     Attributes:
-        step: title of its step.
-        answer: of the job.
-        measures: of the job, by name.
-        spacing_m: of the samples for its Chamfer distance.
+        step: its step's title.
+        answer: the job's answer.
+        measures: the job's measures, by name.
+        spacing_m: spacing of the samples for its Chamfer distance.
         files: its artefacts by kind.
     """
 
@@ -190,7 +196,7 @@ class RecordedFusion:
 
 
 def recorded_fusion(summary: RunSummary) -> RecordedFusion | None:
-    """The fusion whose mesh is the run's ground truth; None if that is the scan.
+    """Return the fusion whose mesh is the run's ground truth; None if that is the scan.
 
     Raises:
         DataError: the job that made the mesh is not in the record.
@@ -213,7 +219,7 @@ def _read(step: str, job: JobState, files: Mapping[str, ArtefactRef]) -> Recorde
 
 @lru_cache(maxsize=16)
 def control_centres(scan: tuple[Point, ...], control: tuple[Point, ...]) -> tuple[Point, ...]:
-    """Centres that only the control scan shows, in the frame of the scan."""
+    """Return centres that only the control scan shows, in the frame of the scan."""
     if not scan or not control:
         return ()
     from service.compute.surfaces.constellations import match_constellations  # noqa: PLC0415 - loads scipy

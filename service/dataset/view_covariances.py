@@ -1,4 +1,4 @@
-"""Tells the covariance of each pose of a data set, and their joint one, as far as the record states them."""
+"""Computes the covariance of each pose of a data set, and their joint one, as far as the record states them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from service.jobs.register import Registration
 
 
 def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:
-    """(6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, without the errors that are common to all.
+    """Return the joint covariance (6 N, 6 N) of T_scan_camera of these viewpoints, without errors common to all.
 
     Stated for poses of structure from motion: the covariance of their bundle adjustment, after a similarity has
     aligned the positions with the true ones, in the scan's axes and in metres. The error of the scale is not in it,
@@ -44,7 +44,7 @@ def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequen
 
 
 def stated_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:
-    """(6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, with that of the registration.
+    """Return (6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, with that of the registration.
 
     Stated for poses of an arm and of the spheres. None for other poses, and in runs of earlier versions.
 
@@ -59,7 +59,7 @@ def stated_pose_errors(summary: RunSummary, registered: Registration, names: Seq
 
 
 def _joint(summary: RunSummary, sha256: str, array: str, names: Sequence[str]) -> Array:
-    """(6 N, 6 N) of these viewpoints, from a file that has their names beside the array."""
+    """Return (6 N, 6 N) of these viewpoints, from a file that has their names beside the array."""
     with np.load(io.BytesIO(summary.store.artefact_path(sha256).read_bytes()), allow_pickle=False) as archive:
         order: list[str] = json.loads(str(archive["names"]))
         rows = (6 * np.array([order.index(name) for name in names])[:, None] + np.arange(6)).ravel()
@@ -67,14 +67,14 @@ def _joint(summary: RunSummary, sha256: str, array: str, names: Sequence[str]) -
 
 
 def _tracks(summary: RunSummary, registered: Registration) -> str | None:
-    """The file with the tracks from which the poses of a registration were adjusted."""
+    """Return the file with the tracks from which the poses of a registration were adjusted."""
     made = _job(summary, registered)
     tracks = None if made is None else made.arguments.get("tracks")
     return tracks if isinstance(tracks, str) else None
 
 
 def _job(summary: RunSummary, registered: Registration) -> JobState | None:
-    """The job that computed a registration."""
+    """Return the job that computed a registration."""
     finished = (job for job in jobs_of(summary.state).values() if job.status == "finished")
     made = (job for job in finished if job.kind == register.KIND.name)
     return next((job for job in made if register.KIND.read_answer(job.result) == registered), None)
@@ -103,12 +103,12 @@ _BOTH = (
 
 @dataclass(frozen=True, slots=True)
 class ViewCovariances:
-    """What is stated of the errors of T_scan_camera.
+    """The recorded covariances of the errors of T_scan_camera.
 
     Attributes:
         covariance: (6, 6) by viewpoint, as `View.covariance`.
-        words: what they hold.
-        joint: (6 N, 6 N) of all viewpoints, as `DataSet.pose_errors`; None where it is not stated.
+        words: a text on what they hold.
+        joint: (6 N, 6 N) of all viewpoints, as `DataSet.pose_errors`; None where it is not known.
     """
 
     covariance: dict[str, Array]
@@ -119,7 +119,7 @@ class ViewCovariances:
 def view_covariances(
     summary: RunSummary, own: str, registered: Registration, names: Sequence[str]
 ) -> ViewCovariances:
-    """What the record states of the poses of the run's own registration.
+    """Return what the record states of the errors of the poses of the run's own registration.
 
     Hybrid poses have a covariance each, poses of an arm and of the spheres a joint one. The others have that of the
     registration, seen from each camera, and with it that of the bundle adjustment, where there was one. So have poses
@@ -127,7 +127,7 @@ def view_covariances(
 
     Args:
         summary: the run.
-        own: name of its registration.
+        own: the name of its registration.
         registered: that registration.
         names: viewpoints, in the order of the rows of the joint covariance.
 
@@ -153,18 +153,18 @@ def view_covariances(
 
 
 def _blocks(joint: Array) -> list[Array]:
-    """(6, 6) of each pose from the joint covariance (6 N, 6 N)."""
+    """Return (6, 6) of each pose from the joint covariance (6 N, 6 N)."""
     return [joint[k : k + 6, k : k + 6] for k in range(0, len(joint), 6)]
 
 
 def _of_arm(registered: Registration) -> str:
-    """What the covariances of an arm's poses hold, in words."""
+    """Describe what the covariances of an arm's poses hold."""
     words = _ARM if registered.T_scan_camera_given is None else _REFINED
     return words.format(mm=mm(registered.pose_sigma_m or 0.0), mrad=mrad(registered.pose_sigma_rad or 0.0))
 
 
 def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: Transform) -> Array:
-    """(6, 6) covariance of T_scan_camera that the covariance (6 or 7, …) of T_world_scan causes.
+    """Return (6, 6) covariance of T_scan_camera that the covariance (6 or 7, …) of T_world_scan causes.
 
     T_scan_camera = T_world_scan^-1 T_world_camera with the camera held: with R of T_world_scan and the vector a from
     its origin to the camera, in the world's axes, d_scan = R^T (a x w - d) and w_scan = -R^T w.
@@ -177,7 +177,7 @@ def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: T
 
 
 def _of_hybrid(summary: RunSummary) -> dict[str, Array]:
-    """Of the newest hybrid poses from photographs at full size; empty if their covariance is in another frame."""
+    """Return the covariances of the newest hybrid poses from photographs at full size; none in other frames."""
     jobs = [job for step in summary.state.steps.values() for job in step.jobs.values()]
     for job in sorted(jobs, key=lambda job: job.ended_seq, reverse=True):
         reduced = any(job.arguments.get(key) is not None for key in ("reduced_to", "full_camera"))

@@ -38,7 +38,7 @@ def file_log(
     handler: BoundedFile | None = None,
     admits: Callable[[logging.LogRecord], bool] | None = None,
 ) -> Generator[None]:
-    """Within this block, also write log records to `data`/logs: ours from INFO up, other libraries' from WARNING up.
+    """Also write log records to `data`/logs in this block: ours from INFO up, other libraries' from WARNING up.
 
     Args:
         data: the data folder; nothing is written until it exists.
@@ -225,7 +225,7 @@ _PATTERNS = (
 
 
 def without_secrets(value: Any, name: str = "") -> Any:
-    """A copy of plain data with secrets replaced by `[secret]`, found by field name and by pattern within text."""
+    """Return a copy of plain data with secrets replaced by `[secret]`, found by field name and by pattern in text."""
     if name and _NAME.fullmatch(name) and value not in (None, "", False, True):
         return OUT
     if isinstance(value, str):
@@ -255,5 +255,5 @@ def at(**names: str) -> None:
 
 
 def where_now() -> Mapping[str, str]:
-    """The names that are set now."""
+    """Return the names that are set now."""
     return _now

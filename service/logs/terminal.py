@@ -1,4 +1,4 @@
-"""Keeps the words of libraries from the terminal: people read there what this program says, in its own words.
+"""Keeps the output of libraries from the terminal, so that people read there only what this program says.
 
 Records of libraries still reach the log files of the data folder, from warnings up. With ORTHOCAPTURE_LIBRARY_WORDS=1
 in the environment, everything appears on the terminal too.
@@ -23,10 +23,10 @@ _open_files: list[int] = []  # what C writes to instead of the terminal; it must
 
 
 def show_own_words_only() -> None:
-    """From now on, show the log records of this program only, and nothing of what native libraries print.
+    """Show only the log records of this program from now on, and nothing of what native libraries print.
 
     It comes before libraries are imported, and holds for those too whose import sets the level of their loggers, as
-    pydicom's does. What is written to the error stream by Python stays: tracebacks, and the words of child processes.
+    pydicom's does. What Python writes to the error stream stays: tracebacks, and the output of child processes.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(EscapingFormatter("%(asctime)s %(name)s %(levelname)s %(message)s"))
@@ -44,12 +44,12 @@ class EscapingFormatter(logging.Formatter):
     """Lines in which nothing is left that a terminal would obey: messages may quote a device or a file."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One record as lines."""
+        """Return one record as lines."""
         return shown_continued(super().format(record))
 
 
 def is_own(record: logging.LogRecord) -> bool:
-    """Whether a record is of this program, not of a library."""
+    """Return whether a record is of this program, not of a library."""
     return record.name.partition(".")[0] in _OURS
 
 

@@ -87,7 +87,7 @@ class Alarm:
 
 
 def alarm_of(rig: Rig, run_id: str, clock: Clock) -> Alarm | None:
-    """The alarm configured in the rig file; None if it has no `alerts`."""
+    """Return the alarm configured in the rig file; None if it has no `alerts`."""
     section = rig.section.alerts
     return None if section is None else Alarm(section, run_id, rig.section.name, clock=clock)
 

@@ -35,7 +35,7 @@ _LAST_CAPTURES = 21  # used for the median time per viewpoint
 
 @dataclass(frozen=True, slots=True)
 class DeviceFigures:
-    """What a run last recorded about a device."""
+    """The state of a device as a run last recorded it."""
 
     run_id: str
     device: str  # name in rig.yaml
@@ -51,7 +51,7 @@ class DrivenRun:
     run_id: str
     doing: Doing
     robot: RobotPhase
-    silent_s: float  # since its runner last reported; inf: never
+    silent_s: float  # seconds since its runner last reported; inf: never
     viewpoint_s: float | None  # median time between the last exposures of one step; None: too few yet
 
 
@@ -185,7 +185,7 @@ def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
 
 
 def _database_bytes(path: Path) -> int:
-    """Size including the write-ahead log."""
+    """Return the size including the write-ahead log."""
     parts = (path, path.with_name(path.name + "-wal"))
     return sum(part.stat().st_size for part in parts if part.exists())
 
@@ -195,7 +195,7 @@ _SILENT_S = 60.0  # a runner's longest call, fetching one photograph, is shorter
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What is wrong with each part; "" if nothing is."""
+    """The problem of each part; "" if it has none."""
 
     database: str
     data_folder: str
@@ -205,7 +205,7 @@ class Health:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """True if no part has a problem."""
         return not (self.database or self.data_folder or self.worker or self.runners or self.second_place)
 
 
@@ -263,9 +263,9 @@ _INTERRUPTS = ("operator_action", "leave_lapsed")
 
 
 def read_step_times(store: Store, run_id: str) -> EarlierTimes:
-    """Seconds from the beginning of each step's work to its figures, in the earlier runs of the run's protocol.
+    """Return the seconds from the start of each step's work to its figures, in earlier runs of the run's protocol.
 
-    Runs of a simulated rig tell nothing of a real one, nor the other way round. Raises StoreError.
+    Runs of a simulated rig say nothing of a real one, nor the other way round. Raises StoreError.
     """
     mine = store.first_event(run_id).payload
     assert isinstance(mine, RunStarted)  # checked when the run was read

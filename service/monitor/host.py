@@ -1,4 +1,4 @@
-"""Tells how this machine does: how well its clock is synchronised, and how long threads waited for a processor."""
+"""Measures how this machine does: how well its clock is synchronised, and how long threads waited for a processor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NOT_SET_S = 16.0  # the kernel's value for an unknown error
 
 
 def host_clock() -> HostClock:
-    """The clock's state now; unknown values are None. Never raises."""
+    """Return the clock's state now; unknown values are None. Never raises."""
     return _of_chrony() or _of_kernel()
 
 
@@ -65,7 +65,7 @@ class _Timex(ctypes.Structure):
 
 
 def _of_kernel() -> HostClock:
-    """Whether the clock is synchronised, and the kernel's bound of its error; the kernel knows no offset."""
+    """Read whether the clock is synchronised, and the kernel's bound of its error; the kernel knows no offset."""
     nothing = HostClock(source="", synchronised=None, offset_s=None)
     if not sys.platform.startswith("linux"):
         return nothing
@@ -83,7 +83,7 @@ def _of_kernel() -> HostClock:
 
 
 def processor_s() -> float:
-    """Seconds that this thread has computed or waited for a processor, as far as the system tells of waits."""
+    """Return the seconds that this thread has computed or waited for a processor, if the system reports waits."""
     try:
         times = processor_time(threading.get_native_id())
     except OSError:
@@ -92,7 +92,7 @@ def processor_s() -> float:
 
 
 def waited_s(thread: int) -> float:
-    """Seconds that a thread (its native id) has waited for a processor; 0 where no system tells it."""
+    """Return the seconds that a thread (its native id) has waited for a processor; 0 if the system does not say."""
     try:
         return processor_time(thread).waited_s
     except OSError:

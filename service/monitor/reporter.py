@@ -87,7 +87,7 @@ def read_robot(devices: OpenDevices) -> RobotReading:
 
 
 def watch_robot(devices: OpenDevices, now_s: float) -> RobotReading:
-    """The open robots' gravest state by their pose streams up to `now_s` (monotonic), which satisfies no watchdog."""
+    """Return the open robots' gravest state by their pose streams up to `now_s` (monotonic). No watchdog is fed."""
     return _gravest(_watched(name, robot, now_s) for name, robot in devices.robots.items())
 
 
@@ -192,7 +192,7 @@ _TOWER: Mapping[Standing, TowerLight] = {
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """What the main loop reported last; a change of it is written at once."""
+    """The last report of the main loop; a change of it is written at once."""
 
     doing: Doing = "unknown"
     step: str = ""
@@ -203,7 +203,7 @@ class _Moment:
 
 @dataclass
 class Reporter:
-    """Told by the runner's thread what goes on; heartbeat threads keep writing it while that thread is busy.
+    """Writes what the runner's thread reports; heartbeat threads go on writing it while that thread is busy.
 
     Only the runner's thread talks to devices, with one exception: while it is in a long call, a heartbeat thread
     reads the pose stream, which satisfies no watchdog (`RobotArm.samples`). A device that does not answer is shown as
@@ -227,7 +227,7 @@ class Reporter:
     _heartbeat: Heartbeat = field(init=False)
     _moment: _Moment | None = None
     _attends: tuple[int, float] = (0, 0.0)  # the main loop's thread, and how long it had waited for a processor
-    _tower_light: TowerLight | None = None  # that the signal tower shows
+    _tower_light: TowerLight | None = None  # the light that the signal tower shows
     _light: LightReading = field(default_factory=LightReading)
     _camera: CameraReading = field(default_factory=CameraReading)
     _due_s: dict[str, float] = field(default_factory=dict[str, float])
@@ -259,11 +259,11 @@ class Reporter:
     def attend(
         self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False, asks: Asks = "", words: str = ""
     ) -> None:
-        """Called by the main loop between calls: read the devices and write the snapshot if it is due.
+        """Read the devices and write the snapshot if it is due; the main loop calls this between its calls.
 
         Args:
-            asks: what people are asked for now; "" for nothing.
-            words: the question, or what goes on, for alerts.
+            asks: the thing that people are asked for now; "" for nothing.
+            words: the text of the question, or of what goes on, for alerts.
         """
         self._activity = ("", 0.0)
         thread = threading.get_native_id()
@@ -286,7 +286,7 @@ class Reporter:
             self._frame()
 
     def _snapshot(self, moment: _Moment, words: str, devices: OpenDevices) -> Snapshot:
-        """The state now, with readings of the devices that are due."""
+        """Return the state now, with readings of the devices that are due."""
         robot = read_robot(devices)
         # What a device told that is not connected any more is not the present state of anything.
         self._light = self._light if devices.lightboxes else LightReading()
@@ -337,7 +337,7 @@ class Reporter:
             self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
 
     def _starved_s(self) -> float:
-        """How long the main loop has waited for a processor since it last reported."""
+        """Return how long the main loop has waited for a processor since it last reported."""
         thread, waited_before_s = self._attends
         return waited_s(thread) - waited_before_s if thread else 0.0
 
@@ -349,7 +349,7 @@ class Reporter:
         self._watched = (asked_s, watch_robot(self.devices(), self.clock.monotonic_s()))
 
     def _elsewhere(self) -> str:
-        """The run's state in a few words, for alerts."""
+        """Return the run's state in a few words, for alerts."""
         newest = self._newest
         if newest.robot in STOPS:
             return f"the robot reports: {newest.robot.replace('_', ' ')}"

@@ -41,7 +41,7 @@ class Message(Record):
 
 
 class Snapshot(Record):
-    """What a runner reports about itself, its devices and its machine. Unknown values are None or "unknown".
+    """A runner's report on itself, its devices and its machine. Unknown values are None or "unknown".
 
     A heartbeat thread writes it (`at_utc_s`) and states since when the main loop has been in a long call
     (`attended_utc_s`), which call that is, and when the robot was last heard from.
@@ -50,9 +50,9 @@ class Snapshot(Record):
     at_utc_s: float = 0.0
     attended_utc_s: float = 0.0  # 0: same as at_utc_s
     robot_utc_s: float = 0.0  # 0: same as attended_utc_s
-    starved_s: float = 0.0  # for which the main loop waited for a processor since its last report
+    starved_s: float = 0.0  # seconds for which the main loop waited for a processor since its last report
     activity: str = ""  # the long call of the main loop, in words
-    activity_utc_s: float = 0.0  # when it began
+    activity_utc_s: float = 0.0  # the time when it began
     pid: int = 0
     doing: Doing = "unknown"
     step: str = ""
@@ -62,23 +62,23 @@ class Snapshot(Record):
     total: int = 0
     messages: tuple[Message, ...] = ()  # newest last
     robot: RobotPhase = "unknown"
-    robot_name: str = ""  # in rig.yaml
+    robot_name: str = ""  # the name in rig.yaml
     speed_fraction: float | None = None
     camera_battery_fraction: float | None = None
     camera_free_bytes: int | None = None
     light_lux: float | None = None
     temperature_c: float | None = None
     disk_free_bytes: int | None = None
-    asks: Asks = ""  # what people are asked for now
+    asks: Asks = ""  # the thing that people are asked for now
     question: str = ""
     pedal_armed: bool = False  # pressed once; a second press lets the robot move
 
     def age_s(self, now_utc_s: float) -> float:
-        """Seconds since it was written, by now."""
+        """Return the seconds since it was written, by now."""
         return now_utc_s - self.at_utc_s
 
     def shown(self) -> tuple[object, ...]:
-        """What a screen shows, rounded to visible steps: without rounding, noise would redraw every page."""
+        """Return what a screen shows, rounded to visible steps: without rounding, noise would redraw every page."""
         steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
         seen: dict[str, Any] = dict(self) | {"at_utc_s": 0.0, "activity_utc_s": 0.0, "activity": self.lasting}
         seen |= {"attended_utc_s": self.quiet_s // _QUIET_STEP_S, "robot_utc_s": self.robot_silent_s > STALE_S}
@@ -88,7 +88,7 @@ class Snapshot(Record):
         return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())
 
     def stale(self, now_utc_s: float) -> bool:
-        """Whether it is by now too old to tell the current state, or from before the clock was set back."""
+        """Return whether it is too old by now to show the current state, or is from before the clock was set back."""
         return abs(self.age_s(now_utc_s)) > (STARTING_S if self.doing == "starting" else STALE_S)
 
     @property
@@ -106,7 +106,7 @@ class Snapshot(Record):
         return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
 
     def unattended_s(self, now_utc_s: float) -> float:
-        """Seconds since the main loop's last report, by now; infinity if the clock was set back since."""
+        """Return the seconds since the main loop's last report, by now; infinity if the clock was set back since."""
         return age_s(self.at_utc_s, now_utc_s, if_set_back_s=math.inf) + self.quiet_s
 
     @property
@@ -130,7 +130,7 @@ def _path(data: Path, run_id: str, suffix: str) -> Path:
 
 
 def log_path(data: Path, run_id: str) -> Path:
-    """Path of the file that takes the output of a run's runner."""
+    """Return the path of the file that takes the output of a run's runner."""
     return _path(data, run_id, "log")
 
 
@@ -140,7 +140,7 @@ def write_snapshot(data: Path, run_id: str, snapshot: Snapshot) -> None:
 
 
 def read_snapshot(data: Path, run_id: str, now_utc_s: float) -> Snapshot:
-    """The latest snapshot; an unknown one if there is none, or if its runner has by now fallen silent."""
+    """Return the latest snapshot; an unknown one if there is none, or if its runner has by now fallen silent."""
     try:
         snapshot = Snapshot.model_validate_json(_path(data, run_id, "json").read_bytes())
     except (OSError, ValidationError):
@@ -159,7 +159,7 @@ def ask_for_frames(data: Path, run_id: str, camera: str = "") -> None:
 
 
 def frames_wanted(data: Path, run_id: str, now_utc_s: float, *, within_s: float = 3.0) -> str | None:
-    """The camera at whose live view somebody has looked within this time, last; "": the first one; None: nobody."""
+    """Return the camera whose live view was last looked at within this time; "": the first one; None: none was."""
     path = _path(data, run_id, "wanted")
     try:
         age = age_s(path.stat().st_mtime, now_utc_s, if_set_back_s=math.inf)
@@ -174,7 +174,7 @@ def write_frame(data: Path, run_id: str, jpeg: bytes, camera: str = "") -> None:
 
 
 def frame_path(data: Path, run_id: str, camera: str = "") -> Path:
-    """Path of the latest frame of a camera, which may not exist; its modification time tells its age."""
+    """Return the path of a camera's latest frame, which may not exist; its modification time shows its age."""
     named = f"{hashlib.sha256(camera.encode()).hexdigest()[:16]}." if camera else ""
     return _path(data, run_id, f"{named}jpg")
 
@@ -192,7 +192,7 @@ _log = logging.getLogger(__name__)
 
 
 class WorkerSign(Record):
-    """What a worker reports about itself."""
+    """A worker's report on itself."""
 
     host: str
     pid: int
@@ -200,7 +200,7 @@ class WorkerSign(Record):
     jobs_done: int
 
     def lives(self, now_utc_s: float) -> bool:
-        """Whether it has reported lately, by now, and is not known to be dead."""
+        """Return whether the worker has reported lately, by now, and is not known to be dead."""
         if self.host == socket.gethostname() and not psutil.pid_exists(self.pid):
             return False
         return abs(now_utc_s - self.at_utc_s) <= _STALE_S
@@ -237,7 +237,7 @@ class SignOfLife:
 
 
 def living_workers(data: Path, clock: Clock) -> list[WorkerSign]:
-    """The workers of a data folder that are alive, as far as is known; removes the files of dead ones."""
+    """Return the workers of a data folder that are alive, as far as is known; removes the files of dead ones."""
     now_utc_s = clock.utc_s()
     found: list[WorkerSign] = []
     for path in sorted(_folder(data).glob("*.json")):

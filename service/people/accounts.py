@@ -48,21 +48,21 @@ class Accounts:
         self._known = known
 
     def all(self) -> list[Account]:
-        """Every account, sorted by name."""
+        """Return every account, sorted by name."""
         with self._store.database.reading() as connection:
             return [to_account(row) for row in connection.execute(select(accounts).order_by(accounts.c.account))]
 
     def get(self, account: str) -> Account:
-        """The account of this name. Raises AccountError if there is none."""
+        """Return the account of this name. Raises AccountError if there is none."""
         with self._store.database.reading() as connection:
             return to_account(get_account(connection, account))
 
     def strangers_wait(self, account: Account) -> bool:
-        """Whether wrong passwords have closed the account to strangers; both clocks must say that it is over."""
+        """Return whether wrong passwords still close the account to strangers, until both clocks say it is over."""
         return self._store.ages.at_least_s(account.locked_until_utc_s) < 0
 
     def waits_until_utc_s(self, account: Account) -> float:
-        """Until when somebody has to wait after wrong passwords of the account; 0 if nobody has to."""
+        """Return until when somebody has to wait after wrong passwords of the account; 0 if nobody has to."""
         known_s = self._known.longest_wait_s(account.account)
         strangers_s = account.locked_until_utc_s if self.strangers_wait(account) else 0.0
         return max(strangers_s, self._store.clock.utc_s() + known_s if known_s else 0.0)
@@ -70,14 +70,14 @@ class Accounts:
     # --- one-time links ---
 
     def first_link(self) -> str | None:
-        """A new one-time token for making the first administrator, or None if there is one already."""
+        """Return a new one-time token for making the first administrator, or None if there is one already."""
         with self._store.database.writing() as connection:
             if self._administrators(connection):
                 return None
             return self._new_link(connection, "", FIRST_LINK_S, actor=SERVICE)
 
     def invitation(self, token: str) -> Invitation:
-        """The invitation of a link. Raises LinkError if the link is unknown, used or too old."""
+        """Return the invitation of a link. Raises LinkError if the link is unknown, used or too old."""
         with self._store.database.reading() as connection:
             return self._invitation(connection, token)
 

@@ -24,12 +24,12 @@ class Approval:
     payload: ProtocolApproved
     by: str
     at_utc: str
-    seq: int  # in the site's chain
+    seq: int  # number of the event in the site's chain
 
 
 @dataclass(frozen=True, slots=True)
 class ProtocolStanding:
-    """Whether a protocol file is approved on a site.
+    """The standing of a protocol file on a site: its approval, or that of another content.
 
     Attributes:
         approval: the approval of exactly this content; None if there is none.
@@ -41,12 +41,12 @@ class ProtocolStanding:
 
     @property
     def changed(self) -> bool:
-        """Whether this content is not approved, but other content of the same id and version is."""
+        """True if this content is not approved, but other content of the same id and version is."""
         return self.approval is None and self.other is not None
 
 
 def approvals(store: Store, protocol: str, version: str) -> list[Approval]:
-    """All approvals for an id and version of a protocol, oldest first."""
+    """Return all approvals for an id and version of a protocol, oldest first."""
     found = (
         select(events)
         .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))
@@ -68,7 +68,7 @@ def _same(one: Approval, protocol: str, version: str) -> bool:
 
 
 def standing_of(store: Store, loaded: LoadedProtocol) -> ProtocolStanding:
-    """The standing of a protocol file on this site."""
+    """Return the standing of a protocol file on this site."""
     known = approvals(store, loaded.protocol.id, loaded.protocol.version)
     mine = [one for one in known if one.payload.sha256 == loaded.sha256]
     others = [one for one in known if one.payload.sha256 != loaded.sha256]
@@ -112,7 +112,7 @@ def approve(
 
 
 def difference(before: str, now: str) -> list[str]:
-    """The lines that differ, each with − or + and its line number, such as `− 41: min: 0.9`."""
+    """Return the lines that differ, each with − or + and its line number, such as `− 41: min: 0.9`."""
     out: list[str] = []
     old = new = 0
     for line in list(unified_diff(before.splitlines(), now.splitlines(), n=0, lineterm=""))[2:]:

@@ -36,7 +36,7 @@ def identity_for(
     known_by: KnownBy = "password",
     origin: SecretOrigin = TERMINAL,
 ) -> Identity | None:
-    """The person who acts, if the verb now needs a role; else None.
+    """Return the person who acts, if the verb now needs a role; else None.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.
@@ -47,7 +47,7 @@ def identity_for(
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
-    """The person who acts on the command line: by password where there are accounts, else by claim.
+    """Return the person who acts on the command line: by password where there are accounts, else by claim.
 
     Raises:
         NotAllowedError: there are accounts, and none has this name; or there are none, and this is no person's name.
@@ -68,7 +68,7 @@ def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identit
 
 
 def who_pauses(people: People, typed: str) -> Identity:
-    """Whoever pauses a run, without a password and whatever the name: pausing is always safe.
+    """Identify whoever pauses a run, without a password and whatever the name: pausing is always safe.
 
     Where there are accounts, the record says that the name was only claimed.
     """
@@ -92,7 +92,7 @@ def identify(
         role: the role that the action needs.
         secret: asks for the secret; not called on a site without accounts, where the name is a claim.
         known_by: the kind of secret: the account's password, PIN or badge.
-        origin: where it is typed.
+        origin: the place where the secret is typed.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.
@@ -111,7 +111,7 @@ def identify(
 
 
 def _claimed(typed: str) -> str:
-    """A name on a site without accounts. Raises NotAllowedError if it is no person's name."""
+    """Return a name on a site without accounts. Raises NotAllowedError if it is no person's name."""
     try:
         return person_name(typed)
     except ConfigurationError as error:

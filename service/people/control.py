@@ -25,7 +25,7 @@ _DECIDE_AGAIN = "Read what the page shows now and decide again; nothing was done
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who has control of a run, who asks for it, and who was refused it; "" for nobody.
+    """The holder of control of a run, who asks for it, and who was refused it; "" for nobody.
 
     When a sign-in ends, so does its control.
     """
@@ -38,7 +38,7 @@ class Holder:
     asked_by_account: str = ""
     asked_by_name: str = ""
     asked_utc_s: float = 0.0
-    refused_screen: str = ""  # that asked last and was refused; until somebody asks again, or control changes
+    refused_screen: str = ""  # the one that was refused last; until somebody asks again, or control changes
     refused_utc_s: float = 0.0
 
 
@@ -53,7 +53,7 @@ class Control:
         self._store = store
 
     def holder(self, run_id: str) -> Holder:
-        """Who has control of the run now. Raises UnknownRunError."""
+        """Return who has control of the run now. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
             return self._holder(connection, run_id)
 
@@ -194,7 +194,7 @@ class Control:
         )
 
     def _valid(self, connection: Connection, screen: str) -> Row[Any, Any, Any, Any] | None:
-        """The sign-in on a screen, unless it has ended."""
+        """Return the sign-in on a screen, unless it has ended."""
         row = connection.execute(
             select(sessions.c.account, sessions.c.locked, sessions.c.created_utc_s, accounts.c.full_name)
             .join(accounts, sessions.c.account == accounts.c.account)
@@ -243,7 +243,7 @@ class Control:
 
 
 def _full_name(connection: Connection, account: str) -> str:
-    """The name of the person with an account; "" for nobody."""
+    """Return the name of the person with an account; "" for nobody."""
     return connection.execute(select(accounts.c.full_name).where(accounts.c.account == account)).scalar() or ""
 
 

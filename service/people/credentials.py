@@ -31,11 +31,11 @@ class Passwords:
         self._hasher = hasher or PasswordHasher()
 
     def hash(self, secret: str) -> str:
-        """The hash to store, salt and parameters included."""
+        """Return the hash to store, salt and parameters included."""
         return self._hasher.hash(_same_form(secret))
 
     def matches(self, stored: str, secret: str) -> bool:
-        """Whether a secret belongs to a stored hash; takes the same time if nothing is stored ("")."""
+        """Return whether a secret belongs to a stored hash; takes the same time if nothing is stored ("")."""
         if not stored:
             self.hash(secret)  # for nothing: to verify is to hash once, and to compare
             return False
@@ -45,14 +45,14 @@ class Passwords:
             return False
 
     def is_outdated(self, stored: str) -> bool:
-        """Whether a stored hash was made with parameters other than the present ones."""
+        """Return whether a stored hash was made with parameters other than the present ones."""
         return self._hasher.check_needs_rehash(stored)
 
 
 class ShortSecrets:
     """Hashes of PINs and badges, which whoever has a hash could guess: bound to a key outside the database.
 
-    A copy of the database alone, such as a backup without keys, tells nobody a PIN. Hashes of earlier versions are
+    A copy of the database alone, such as a backup without keys, gives nobody a PIN. Hashes of earlier versions are
     accepted until they are renewed.
     """
 
@@ -61,22 +61,25 @@ class ShortSecrets:
         self._pepper = pepper
 
     def hash(self, secret: str) -> str:
-        """The hash to store, with the name of the key to which it is bound. Raises StoreError without that key."""
+        """Return the hash to store, with the name of the key to which it is bound.
+
+        Raises StoreError without that key.
+        """
         return f"{self._bound()}{self._passwords.hash(self._pepper.bind(_same_form(secret)))}"
 
     def matches(self, stored: str, secret: str) -> bool:
-        """Whether a secret belongs to a stored hash; takes the same time if it cannot. Raises StoreError."""
+        """Return whether a secret belongs to a stored hash; takes the same time if it cannot. Raises StoreError."""
         if not stored.startswith(_BOUND):
             return self._passwords.matches(stored, secret)
         mine = "" if self.is_lost(stored) else stored.removeprefix(self._bound())
         return self._passwords.matches(mine, self._pepper.bind(_same_form(secret)))
 
     def is_outdated(self, stored: str) -> bool:
-        """Whether a stored hash is not bound to the key, or was made with parameters other than the present ones."""
+        """Return whether a stored hash is not bound to the key, or was made with other parameters than now."""
         return not stored.startswith(_BOUND) or self._passwords.is_outdated(stored.rpartition(":")[2])
 
     def is_lost(self, stored: str) -> bool:
-        """Whether a hash is bound to a key that is not here any more, so that nothing matches it."""
+        """Return whether a hash is bound to a key that is not here any more, so that nothing matches it."""
         return stored.startswith(_BOUND) and not stored.startswith(self._bound())
 
     def _bound(self) -> str:
@@ -107,7 +110,7 @@ def require_pin(pin: str) -> None:
 
 
 def plain_badge(typed: str) -> str:
-    """A badge's code in the form that is hashed. Raises AccountError if it cannot be a badge's."""
+    """Return a badge's code in the format that is hashed. Raises AccountError if it cannot be a badge's."""
     plain = typed.strip().upper()
     if not _BADGE.fullmatch(plain):
         raise AccountError(
@@ -119,12 +122,12 @@ def plain_badge(typed: str) -> str:
 
 
 def new_token() -> str:
-    """A token of 256 random bits for a cookie or a link."""
+    """Return a token of 256 random bits for a cookie or a link."""
     return secrets.token_urlsafe(32)
 
 
 def token_sha256(token: str) -> str:
-    """SHA-256 (hexadecimal) of a token, which is stored instead of it."""
+    """Return the SHA-256 (hexadecimal) of a token, which is stored instead of it."""
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -139,11 +142,11 @@ class Pepper:
         self._path = store.database_path.parent / KEYS / PEPPER
 
     def name(self) -> str:
-        """A name for the key, which does not tell the key."""
+        """Return a name for the key, which does not reveal the key."""
         return hashlib.sha256(b"name of " + self._key).hexdigest()[:16]
 
     def bind(self, secret: str) -> str:
-        """The keyed hash (HMAC, RFC 2104) of a secret, hexadecimal."""
+        """Return the keyed hash (HMAC, RFC 2104) of a secret, hexadecimal."""
         return hmac.digest(self._key, secret.encode("utf-8", "surrogatepass"), "sha256").hex()
 
     @cached_property

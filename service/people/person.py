@@ -76,7 +76,7 @@ _GRANTED: dict[Role, frozenset[Permission]] = {
 
 
 def may(role: Role, permission: Permission) -> bool:
-    """Whether a role has a permission."""
+    """Return whether a role has a permission."""
     return permission in _GRANTED[role]
 
 
@@ -92,7 +92,7 @@ class Person:
     locked: bool = False
 
     def may(self, permission: Permission) -> bool:
-        """Whether the person's role has a permission."""
+        """Return whether the person's role has a permission."""
         return may(self.role, permission)
 
 
@@ -107,7 +107,7 @@ class Account:
     failures: int  # wrong passwords in a row
     locked_until_utc_s: float  # 0 if not locked out
     created_utc: str
-    badge: bool  # whether it has a badge
+    badge: bool  # true if it has a badge
 
 
 @dataclass(frozen=True, slots=True)

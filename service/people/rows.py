@@ -22,12 +22,12 @@ SESSION_S = 12 * 3600.0
 
 
 def find_account(connection: Connection, account: str) -> Row[Any] | None:
-    """The row of an account, or None."""
+    """Return the row of an account, or None."""
     return connection.execute(select(accounts).where(accounts.c.account == account)).one_or_none()
 
 
 def get_account(connection: Connection, account: str) -> Row[Any]:
-    """The row of an account. Raises AccountError if there is none."""
+    """Return the row of an account. Raises AccountError if there is none."""
     row = find_account(connection, account)
     if row is None:
         raise AccountError(f"there is no account {account!r}", where="account", remedy="See the list of accounts")
@@ -35,19 +35,19 @@ def get_account(connection: Connection, account: str) -> Row[Any]:
 
 
 def full_names(connection: Connection) -> dict[str, str]:
-    """Full name of every account by its name, disabled ones included."""
+    """Return the full name of every account by its name, disabled ones included."""
     rows = connection.execute(select(accounts.c.account, accounts.c.full_name))
     return {row.account: row.full_name for row in rows}
 
 
 def named(account: str, full_names: Mapping[str, str]) -> str:
-    """A person's name in documents: `Full Name (account)`, or just the account."""
+    """Return a person's name in documents: `Full Name (account)`, or just the account."""
     full_name = full_names.get(account, "")
     return f"{full_name} ({account})" if full_name and full_name != account else account
 
 
 def to_account(row: Row[Any]) -> Account:
-    """A row of `accounts` as an Account, without its secrets."""
+    """Return a row of `accounts` as an Account, without its secrets."""
     return Account(
         account=row.account,
         full_name=row.full_name,
@@ -61,7 +61,7 @@ def to_account(row: Row[Any]) -> Account:
 
 
 def to_person(row: Row[Any]) -> Person:
-    """The person in a row of `sessions` joined with `accounts`."""
+    """Return the person in a row of `sessions` joined with `accounts`."""
     return Person(
         account=row.account,
         full_name=row.full_name,
@@ -81,7 +81,7 @@ def record_change(
 ) -> Event:
     """Record a change of an account in the transaction that makes it. Returns the event.
 
-    `secrets` holds the stored forms of new secrets by column; only their hashes go into the chain.
+    `secrets` holds new secrets by column, as they are stored; only their hashes go into the chain.
     """
     hashes = {column: sha256_text(value) for column, value in (secrets or {}).items()}
     (event,) = store.append_site(connection, [change.model_copy(update={"stored": hashes})], actor=actor)
@@ -116,12 +116,12 @@ _BETWEEN = frozenset("._-'")
 
 
 def plain_name(typed: str) -> str:
-    """The account name for a typed name: lower case, in Unicode's form NFKC, without outer blanks."""
+    """Return the account name for a typed name: lower case, in Unicode's form NFKC, without outer blanks."""
     return unicodedata.normalize("NFKC", typed).strip().lower()
 
 
 def require_account_name(typed: str) -> str:
-    """The name of a new account. Raises AccountError if it cannot be one."""
+    """Return the name of a new account. Raises AccountError if it cannot be one."""
     name = _checked(plain_name(typed), "account", ACCOUNT_CHARACTERS)
     parts = all(c in _BETWEEN or c.isdecimal() or unicodedata.category(c)[0] in "LM" for c in name)
     if not parts or not name[0].isalpha() or name[-1] in _BETWEEN:
@@ -134,7 +134,7 @@ def require_account_name(typed: str) -> str:
 
 
 def require_full_name(typed: str) -> str:
-    """The name of a new account's owner. Raises AccountError if it cannot be one."""
+    """Return the name of a new account's owner. Raises AccountError if it cannot be one."""
     return _checked(typed, "full_name", FULL_NAME_CHARACTERS)
 
 

@@ -68,7 +68,7 @@ class People:
         self.badges = Badges(store, self._short, self.check_password)
 
     def first_link(self) -> str | None:
-        """A new one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
+        """Make a one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
         return self.accounts.first_link()
 
     # --- passwords ---
@@ -103,7 +103,7 @@ class People:
             return token
 
     def may_try(self, account: str, address: str) -> bool:
-        """Whether a person may sign in from an address however many others failed there.
+        """Return whether a person may sign in from an address however many others failed there.
 
         So may whoever has signed in from there before, and need not wait for wrong passwords of that account.
         """
@@ -199,7 +199,7 @@ class People:
         return wait_s > 0
 
     def _has_to_wait(self, row: Row[Any]) -> bool:
-        """Whether wrong passwords of strangers have closed the account to them for now.
+        """Return whether wrong passwords of strangers have closed the account to them for now.
 
         A wait longer than the longest comes from a clock that was set back since; it is cut to the longest.
         """
@@ -219,7 +219,7 @@ class People:
             )
 
     def _reset_failures(self, connection: Connection, row: Row[Any], password: str, origin: SecretOrigin) -> None:
-        """Begin to count anew, where the right password was given."""
+        """Start the count again, where the right password was given."""
         values: dict[str, object] = {}
         if not self._known.knows(row.account, origin):
             values = {"failures": 0, "locked_until_utc_s": 0.0}
@@ -236,12 +236,12 @@ class People:
     # --- sign-ins ---
 
     def person(self, token: str, *, idle_lock_s: float, deliberate: bool) -> Person | None:
-        """The person with this token, or None if it is not valid. Locks the screen after `idle_lock_s` idle seconds.
+        """Return the person with this token, None if it is not valid, and lock a screen that was idle too long.
 
         Args:
             token: the cookie's token.
-            idle_lock_s: the site's limit for idle time.
-            deliberate: whether a person acted, rather than the page by itself; only that keeps a screen unlocked.
+            idle_lock_s: the site's limit for idle time, after which the screen is locked.
+            deliberate: true if a person acted, rather than the page by itself; only that keeps a screen unlocked.
         """
         now = self._store.clock.utc_s()
         with self._store.database.reading() as connection:
@@ -327,7 +327,7 @@ class People:
             )
 
     def screens(self, account: str) -> list[Screen]:
-        """The valid sign-ins of an account, newest first."""
+        """Return the valid sign-ins of an account, newest first."""
         with self._store.database.reading() as connection:
             rows = connection.execute(
                 select(sessions)

@@ -35,16 +35,16 @@ _AT_ONCE = 200  # rows
 
 
 def wait_after_s(failures: int) -> float:
-    """Seconds to wait after this many wrong passwords in a row."""
+    """Return the seconds to wait after this many wrong passwords in a row."""
     over = failures - FREE_FAILURES
     return 0.0 if over < 0 else min(FIRST_WAIT_S * 2.0 ** min(over, 10), LONGEST_WAIT_S)
 
 
 @dataclass(frozen=True, slots=True)
 class SecretOrigin:
-    """Where a secret is typed: at a browser's address, on a screen that is signed in, or at a terminal."""
+    """The place where a secret is typed: a browser's address, a screen that is signed in, or a terminal."""
 
-    address: str = ""  # of the browser that signs in
+    address: str = ""  # address of the browser that signs in
     screen: str = ""
     by: str = ""  # the account that is signed in on the screen
 
@@ -53,12 +53,15 @@ TERMINAL = SecretOrigin(address="terminal")
 
 
 def on_screen_of(person: Person) -> SecretOrigin:
-    """The screen on which a person is signed in."""
+    """Return the screen on which a person is signed in."""
     return SecretOrigin(screen=person.screen, by=person.account)
 
 
 def _counted_at(account: str, origin: SecretOrigin) -> tuple[str, str, str]:
-    """Which tries are counted together. For another's secret that is who typed it: a new sign-in is no new count."""
+    """Return the key of the tries that are counted together.
+
+    For another's secret the key is who typed it, so that a new sign-in starts no new count.
+    """
     if not origin.by:
         return account, "address", origin.address
     return (account, "screen", origin.screen) if origin.by == account else (account, "by", origin.by)
@@ -71,15 +74,15 @@ class KnownTries:
         self._store = store
 
     def knows(self, account: str, origin: SecretOrigin) -> bool:
-        """Whether the origin is a screen, a terminal, or an address from which the account has signed in."""
+        """Return whether the origin is a screen, a terminal, or an address from which the account has signed in."""
         return bool(origin.by) or origin == TERMINAL or (account, origin.address) in self._addresses
 
     def wait_s(self, account: str, origin: SecretOrigin) -> float:
-        """Seconds to wait before the next try; 0 for none."""
+        """Return the seconds to wait before the next try; 0 for none."""
         return self._wait_s(_counted_at(account, origin))
 
     def longest_wait_s(self, account: str) -> float:
-        """The longest wait at any of the account's known origins."""
+        """Return the longest wait at any of the account's known origins."""
         return max((self._wait_s(counted) for counted in tuple(self._failed) if counted[0] == account), default=0.0)
 
     def failed(self, account: str, origin: SecretOrigin) -> None:
@@ -88,7 +91,7 @@ class KnownTries:
         self._failed.setdefault(_counted_at(account, origin), _new_count()).append(at_s)
 
     def succeeded(self, account: str, origin: SecretOrigin) -> None:
-        """Begin to count anew after the right password; a sign-in makes its address known."""
+        """Start the count again after the right password; a sign-in makes its address known."""
         self._failed.pop(_counted_at(account, origin), None)
         if origin.address and not origin.by:
             self._addresses.add((account, origin.address))
@@ -104,7 +107,7 @@ class KnownTries:
         return max(0.0, left_s)
 
     def _ended_after(self, account: str, monotonic_s: float) -> bool:
-        """Whether an administrator has ended the account's waits since; perhaps from another process."""
+        """Return whether an administrator has ended the account's waits since; perhaps from another process."""
         ended = (
             _OF_SITE.where(
                 event_index.c.kind == "account_changed",
@@ -148,7 +151,7 @@ class KnownTries:
 
 
 def failed_tries(store: Store, window_s: float) -> list[tuple[str, float]]:
-    """(address, age in s) of every failed try at a sign-in within the last `window_s` seconds, oldest first.
+    """Return (address, age in s) of every failed try at a sign-in within the last `window_s` seconds, oldest first.
 
     A try that seems to be in the future, because the clock was set back, counts as made now. Since the first start of
     the service in the present boot, both clocks must say that a try is old. Raises IntegrityError.
@@ -158,7 +161,7 @@ def failed_tries(store: Store, window_s: float) -> list[tuple[str, float]]:
 
 
 def _recent(store: Store, window_s: float) -> Iterator[tuple[Row[Any], SignInRecorded, float]]:
-    """Row, payload and age of what was recorded of sign-ins within the last `window_s` seconds, newest first."""
+    """Yield row, payload and age of recorded sign-ins within the last `window_s` seconds, newest first."""
     since = _first_start(store)
     newest_first = _OF_SITE.where(event_index.c.kind == "sign_in_recorded").order_by(event_index.c.seq.desc())
     with store.database.reading() as connection:
@@ -172,7 +175,7 @@ def _recent(store: Store, window_s: float) -> Iterator[tuple[Row[Any], SignInRec
 
 
 def _first_start(store: Store) -> float:
-    """Number of the event of the service's first start in the present boot; infinity if there is none."""
+    """Return the number of the event of the service's first start in the present boot; infinity if there is none."""
     boot = store.clock.boot()
     if not boot:
         return inf
@@ -196,7 +199,7 @@ def _new_count() -> deque[float]:
 
 
 def _is_wrong(event: SignInRecorded) -> bool:
-    """Whether a secret was wrong, and it was counted; while one waits, nothing is."""
+    """Return whether a secret was wrong and was counted; nothing is counted while somebody has to wait."""
     return event.outcome == "refused" and event.account != ""
 
 

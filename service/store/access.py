@@ -28,18 +28,21 @@ _REMEDY = (
 
 
 def is_shared(folder: Path) -> bool:
-    """Whether a folder is shared with its group on purpose. Raises OSError."""
+    """Return whether a folder is shared with its group on purpose. Raises OSError."""
     return folder.stat().st_mode & _SHARED == _SHARED
 
 
 def folder_mode(parent: Path) -> int:
-    """The mode of a folder that is made within another: whoever may enter that one may enter it. Raises OSError."""
+    """Return the mode of a folder that is made within another: whoever may enter that one may enter it.
+
+    Raises OSError.
+    """
     mode = stat.S_IMODE(parent.stat().st_mode)
     return 0o700 | mode & (_SHARED if mode & _SHARED == _SHARED else 0) | mode & 0o055
 
 
 def file_mode(folder: Path) -> int:
-    """The mode of a file that is made within a folder: whoever may enter may read it. Raises OSError."""
+    """Return the mode of a file that is made within a folder: whoever may enter may read it. Raises OSError."""
     return folder_mode(folder) & 0o666
 
 
@@ -56,7 +59,7 @@ def make_folder(path: Path, mode: int) -> None:
 
 
 def open_new(path: Path, flags: int, mode: int) -> int:
-    """The descriptor of a file that is made with exactly this mode unless it exists. Raises OSError."""
+    """Return the descriptor of a file that is made with exactly this mode unless it exists. Raises OSError."""
     try:
         descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:
@@ -127,7 +130,7 @@ def close_to_others(folder: Path, database: str) -> None:
 
 
 def _differs(database: Path, kept: int, group: int) -> bool:
-    """Whether a database is for others than its folder. One that does not exist is not."""
+    """Return whether a database is shared otherwise than its folder; one that does not exist is not."""
     try:
         held = database.stat()
     except FileNotFoundError:

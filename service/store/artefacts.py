@@ -38,7 +38,7 @@ _RECORDED = (
 
 
 def relative_path(sha256: str) -> Path:
-    """The path ab/abcdef… below the artefact folder. Raises StoreError if `sha256` is not a SHA-256."""
+    """Return the path ab/abcdef… below the artefact folder. Raises StoreError if `sha256` is not a SHA-256."""
     if not _SHA256.fullmatch(sha256):
         raise StoreError(
             f"{sha256!r} is not a SHA-256", remedy="Use the reference that put_file or put_bytes returned"
@@ -54,7 +54,7 @@ def chunks_of(path: Path) -> Iterator[bytes]:
 
 
 def hash_file(path: Path) -> tuple[str, int]:
-    """SHA-256 and size in bytes of a file. Raises OSError."""
+    """Return the SHA-256 and size in bytes of a file. Raises OSError."""
     meter = _Meter(chunks_of(path))
     for _ in meter:
         pass
@@ -138,7 +138,7 @@ class ArtefactFiles:
             self._durable_shards.add(shard)
 
     def _made_young(self, target: Path) -> bool:
-        """Whether the file exists; if so, touch it, so that it is not removed as an old leftover."""
+        """Touch the file, so that it is not removed as an old leftover. Returns whether it exists."""
         with _locked(self._folder, fcntl.LOCK_SH):
             try:
                 os.utime(target)
@@ -156,7 +156,7 @@ class ArtefactFiles:
             )
 
     def path(self, sha256: str) -> Path:
-        """The file of a recorded artefact. Raises IntegrityError if it is missing."""
+        """Return the file of a recorded artefact. Raises IntegrityError if it is missing."""
         path = self._folder / relative_path(sha256)
         if not path.is_file():
             raise IntegrityError(
@@ -165,7 +165,7 @@ class ArtefactFiles:
         return path
 
     def verified_path(self, sha256: str) -> Path:
-        """The file of a recorded artefact, hashed again. Raises IntegrityError if it is missing or altered."""
+        """Return the file of a recorded artefact, hashed again. Raises IntegrityError if it is missing or altered."""
         path = self.path(sha256)
         self._check_same(path, sha256)
         return path
@@ -208,7 +208,7 @@ def _put_errors() -> Generator[None]:
 
 
 def record_sha256(event_sha256: str, fields: dict[str, Any]) -> str:
-    """SHA-256 that binds an artefact's row to its event; the field `record_sha256` is ignored."""
+    """Return the SHA-256 that binds an artefact's row to its event; the field `record_sha256` is ignored."""
     named = {name: value for name, value in fields.items() if name != "record_sha256"}
     return sha256_text(canonical_parsed(named | {"event_sha256": event_sha256}))
 
@@ -276,7 +276,7 @@ def _require_row(connection: Connection, event: Event, ref: ArtefactRef) -> None
 
 
 def read_artefacts(connection: Connection, run_id: str) -> list[Artefact]:
-    """All artefact rows of a run, in the order of its events."""
+    """Return all artefact rows of a run, in the order of its events."""
     rows = connection.execute(
         select(artefacts).where(artefacts.c.run_id == run_id).order_by(artefacts.c.seq, artefacts.c.position)
     )
@@ -284,7 +284,7 @@ def read_artefacts(connection: Connection, run_id: str) -> list[Artefact]:
 
 
 def to_artefact(row: Row[Any]) -> Artefact:
-    """A row of `artefacts` as an Artefact."""
+    """Return a row of `artefacts` as an Artefact."""
     return Artefact(
         run_id=row.run_id,
         seq=row.seq,
@@ -308,7 +308,10 @@ def to_artefact(row: Row[Any]) -> Artefact:
 
 
 def open_folder(data_dir: Path, files: Files, ids: IdSource) -> ArtefactFiles:
-    """The files below a data folder; folders that do not exist are made. Raises StoreError if they cannot be."""
+    """Return the files below a data folder; folders that do not exist are made.
+
+    Raises StoreError if they cannot be.
+    """
     folder = ArtefactFiles(data_dir / "artefacts", files, ids)
     try:
         for directory in (*reversed(data_dir.absolute().parents), data_dir.absolute()):

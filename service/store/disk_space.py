@@ -1,4 +1,4 @@
-"""Tells the used and free disk space and what could be deleted, and removes the files that crashes left."""
+"""Measures the used and free disk space, lists what could be deleted, and removes the files that crashes left."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _WORTH_SAYING_BYTES = 1_000_000
 def forecast_of(
     store: Store, protocol: Protocol, state: RunState | None = None, *, simulated: bool = False
 ) -> Forecast:
-    """The forecast for a run in progress, or for one about to begin (`state` None). Raises StoreError."""
+    """Return the forecast for a run in progress, or for one about to begin (`state` None). Raises StoreError."""
     run_id = "" if state is None else state.run_id
     with store.database.reading() as connection:
         here = read_usage(connection, run_id) if run_id else Usage()
@@ -60,7 +60,7 @@ def require_space(store: Store, found: Forecast) -> None:
 
 
 def require_export_space(store: Store, run_id: str, target: Path) -> None:
-    """Raise SpaceShortError if a copy of a run's files would not fit or would use space kept for the evidence."""
+    """Raise SpaceShortError if a copy of a run's files would not fit or would use space reserved for the evidence."""
     with store.database.reading() as connection:
         usage = read_usage(connection, run_id)
     needed = usage.view_bytes + usage.computed_bytes + usage.other_bytes
@@ -83,7 +83,7 @@ def _same_disk(one: Path, other: Path) -> bool:
 
 
 def read_usage(connection: Connection, run_id: str) -> Usage:
-    """Recorded sizes of a run's files so far."""
+    """Return recorded sizes of a run's files so far."""
     of_event = (event_index.c.run_id == artefacts.c.run_id) & (event_index.c.seq == artefacts.c.seq)
     found = (
         select(event_index.c.kind, func.sum(artefacts.c.size_bytes), func.count(artefacts.c.seq.distinct()))
@@ -100,7 +100,7 @@ def read_usage(connection: Connection, run_id: str) -> Usage:
 
 
 def _before(connection: Connection, run_id: str, protocol_id: str, *, simulated: bool) -> Usage | None:
-    """Usage of the newest other run of the protocol with photographs; None if there is none."""
+    """Return the usage of the newest other run of the protocol with photographs; None if there is none."""
     rows = connection.execute(
         text(
             "SELECT r.run_id FROM runs AS r JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 "
@@ -142,9 +142,9 @@ class Leftover:
     Attributes:
         path: relative to the data folder.
         size_bytes: its size.
-        written_utc: when it was last written or stored again.
+        written_utc: the time when it was last written or stored again.
         kind: `part` is an interrupted write, `unrecorded` a complete file that was never recorded.
-        stays: why it must not be removed now; "" if it may be.
+        stays: the reason why it must not be removed now; "" if it may be.
     """
 
     path: str
@@ -155,7 +155,7 @@ class Leftover:
 
 
 def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]:
-    """Every leftover, sorted by path; nothing is changed.
+    """Return every leftover, sorted by path; nothing is changed.
 
     Other foreign files, neither named by their hash nor an interrupted write, are faults for `audit verify`.
 
@@ -205,7 +205,7 @@ def _refused(error: OSError) -> StoreError:
 
 
 def _candidates(folder: Path) -> list[tuple[Path, float, int]]:
-    """(path, time of last change in s UTC, size in bytes) of files that look like leftovers, sorted by path."""
+    """Return (path, time of last change in s UTC, size in bytes) of possible leftovers, sorted by path."""
     found: list[tuple[Path, float, int]] = []
     for path in sorted(folder.glob("*/*")):
         if path.is_symlink() or not path.is_file():
@@ -247,9 +247,9 @@ def _judged(
 
 
 def _set_forward_s(connection: Connection, clock: Clock) -> float:
-    """By how much UTC has gone on farther than the monotonic clock since the newest event; 0 if it has not.
+    """Return how much farther UTC has gone on than the monotonic clock since the newest event, s; 0 if it has not.
 
-    So much younger a file may be than it seems. Where the host was restarted since, this is 0 or makes files stay.
+    A file may be that much younger than it seems. Where the host was restarted since, this is 0 or makes files stay.
     """
     newest = select(events.c.at_utc, events.c.monotonic_s).join(
         event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
@@ -282,7 +282,7 @@ def _oldest_writer(connection: Connection) -> tuple[float, str]:
 
 
 def _last_start_utc(connection: Connection, run_id: str) -> str:
-    """When a runner last began to work on the run, as it was recorded then; "" if none has."""
+    """Return when a runner last began to work on the run, as it was recorded then; "" if none has."""
     started = (
         select(events.c.at_utc)
         .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))

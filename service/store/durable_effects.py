@@ -123,14 +123,14 @@ def _sync(path: Path, flags: int) -> None:
 
 
 class Signal(Protocol):
-    """What one thread sets and others wait for, as long as a clock says; a `threading.Event` is one."""
+    """A signal that one thread sets and others wait for, as long as a clock says; a `threading.Event` is one."""
 
     def set(self) -> None:
         """Wake all that wait, and let nobody wait any more."""
         ...
 
     def is_set(self) -> bool:
-        """Whether it was set."""
+        """Return whether it was set."""
         ...
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -139,22 +139,22 @@ class Signal(Protocol):
 
 
 class Clock(Protocol):
-    """The source of times, and of waits: whatever waits for a time to come waits on the clock that tells it."""
+    """The source of times, and of waits: whatever waits for a time to come waits on the clock that shows it."""
 
     def utc_now(self) -> datetime:
-        """The present time in UTC, timezone-aware."""
+        """Return the present time in UTC, timezone-aware."""
         ...
 
     def utc_s(self) -> float:
-        """The same in seconds since the epoch."""
+        """Return the same in seconds since the epoch."""
         ...
 
     def monotonic_s(self) -> float:
-        """Monotonic time of the host in seconds; all processes of one boot share its origin."""
+        """Return the monotonic time of the host in seconds; all processes of one boot share its origin."""
         ...
 
     def boot(self) -> str:
-        """The name of the host's present boot; "" if the system has none."""
+        """Return the name of the host's present boot; "" if the system has none."""
         ...
 
     def sleep(self, seconds: float) -> None:
@@ -162,7 +162,7 @@ class Clock(Protocol):
         ...
 
     def signal(self) -> Signal:
-        """A new signal, on which threads wait by this clock."""
+        """Return a new signal, on which threads wait by this clock."""
         ...
 
 
@@ -170,19 +170,19 @@ class SystemClock:
     """The host's clocks."""
 
     def utc_now(self) -> datetime:
-        """The host's time in UTC, timezone-aware."""
+        """Return the host's time in UTC, timezone-aware."""
         return datetime.now(UTC)
 
     def utc_s(self) -> float:
-        """The host's time in seconds since the epoch."""
+        """Return the host's time in seconds since the epoch."""
         return self.utc_now().timestamp()
 
     def monotonic_s(self) -> float:
-        """Seconds of the host's monotonic clock."""
+        """Return the seconds of the host's monotonic clock."""
         return time.monotonic()
 
     def boot(self) -> str:
-        """The boot id of the kernel, "" where it has none."""
+        """Return the boot id of the kernel, "" where it has none."""
         return _BOOT_ID.read_text().strip() if _BOOT_ID.exists() else ""
 
     def sleep(self, seconds: float) -> None:
@@ -190,17 +190,17 @@ class SystemClock:
         time.sleep(seconds)
 
     def signal(self) -> Signal:
-        """A `threading.Event`."""
+        """Return a `threading.Event`."""
         return threading.Event()
 
 
 def moment_of(clock: Clock) -> Moment:
-    """The present moment in both clocks of the host."""
+    """Return the present moment in both clocks of the host."""
     return Moment(clock.monotonic_s(), utc_text(clock.utc_now()), clock.boot())
 
 
 def utc_text(at: datetime) -> str:
-    """An aware time as ISO 8601 text in UTC with microseconds and Z, as in events."""
+    """Return an aware time as ISO 8601 text in UTC with microseconds and Z, as in events."""
     return at.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
@@ -208,15 +208,15 @@ class IdSource(Protocol):
     """The source of names for runs, jobs and tokens; unique within the data folder."""
 
     def new_run(self, at: datetime) -> str:
-        """A name for a run begun at `at`; names sort by time."""
+        """Return a name for a run started at `at`; names sort by time."""
         ...
 
     def new_job(self) -> str:
-        """A name for a job."""
+        """Return a name for a job."""
         ...
 
     def new_token(self) -> str:
-        """An unguessable token: proof of a lease, or name of a temporary file."""
+        """Return an unguessable token: proof of a lease, or name of a temporary file."""
         ...
 
 
@@ -224,15 +224,15 @@ class RandomIds:
     """Random names; that of a run begins with its date and time, so that people can find it."""
 
     def new_run(self, at: datetime) -> str:
-        """A name such as 20260101-080000-a1b2c3, which sorts by time (UTC)."""
+        """Return a name such as 20260101-080000-a1b2c3, which sorts by time (UTC)."""
         return f"{at.astimezone(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
 
     def new_job(self) -> str:
-        """A name of `job-` and 16 random hexadecimal digits."""
+        """Return a name of `job-` and 16 random hexadecimal digits."""
         return f"job-{secrets.token_hex(8)}"
 
     def new_token(self) -> str:
-        """An unguessable token of 32 hexadecimal digits."""
+        """Return an unguessable token of 32 hexadecimal digits."""
         return secrets.token_hex(16)
 
 
@@ -258,15 +258,15 @@ class Ages:
         self._both(since_utc_s)
 
     def at_least_s(self, since_utc_s: float) -> float:
-        """The age in seconds that has surely passed; negative before the time has come."""
+        """Return the age in seconds that has surely passed; negative before the time has come."""
         return min(self._both(since_utc_s))
 
     def at_most_s(self, since_utc_s: float) -> float:
-        """The largest age in seconds that it may have; negative before the time has come."""
+        """Return the largest age in seconds that it may have; negative before the time has come."""
         return max(self._both(since_utc_s))
 
     def _both(self, since_utc_s: float) -> tuple[float, float]:
-        """The age by UTC and that by the monotonic clock."""
+        """Return the age by UTC and that by the monotonic clock."""
         age_s, now_s = self._clock.utc_s() - since_utc_s, self._clock.monotonic_s()
         with self._lock:
             age_then_s, then_s = self._met.setdefault(since_utc_s, (age_s, now_s))

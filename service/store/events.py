@@ -45,7 +45,10 @@ _AFTER = (
 
 
 def canonical(value: object) -> str:
-    """RFC 8785 canonical JSON. Raises StoreError for NaN, infinity, integers beyond 2^53 and lone surrogates."""
+    """Return RFC 8785 canonical JSON.
+
+    Raises StoreError for NaN, infinity, integers beyond 2^53 and lone surrogates.
+    """
     try:
         return rfc8785.dumps(cast("dict[str, Any]", value)).decode()
     except (rfc8785.CanonicalizationError, UnicodeEncodeError, RecursionError) as error:
@@ -56,7 +59,7 @@ def canonical(value: object) -> str:
 
 
 def canonical_parsed(value: object) -> str:
-    """RFC 8785 canonical JSON, several times faster, for plain types as `parse_canonical` returns them.
+    """Return RFC 8785 canonical JSON, several times faster, for plain types as `parse_canonical` returns them.
 
     Raises StoreError for NaN, infinity, integers beyond 2^53 and lone surrogates.
     """
@@ -88,22 +91,22 @@ _READER = json.JSONDecoder(parse_int=_integer)
 
 
 def sha256_text(text: str) -> str:
-    """SHA-256 of the UTF-8 bytes, as 64 hexadecimal digits."""
+    """Return the SHA-256 of the UTF-8 bytes, as 64 hexadecimal digits."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def event_sha256(fields: Mapping[str, Any]) -> str:
-    """SHA-256 of an event from its fields as plain data; the field `sha256` is ignored."""
+    """Return the SHA-256 of an event from its fields as plain data; the field `sha256` is ignored."""
     return sha256_text(canonical({name: value for name, value in fields.items() if name != "sha256"}))
 
 
 def event_sha256_of_text(fields: Mapping[str, Any], payload: str) -> str:
-    """SHA-256 of an event from its other fields and its payload, which is already canonical JSON."""
+    """Return the SHA-256 of an event from its other fields and its payload, which is already canonical JSON."""
     return sha256_text(event_text({name: value for name, value in fields.items() if name != "sha256"}, payload))
 
 
 def event_text(fields: Mapping[str, Any], payload: str) -> str:
-    """Canonical JSON of an event from its other fields and its payload's canonical JSON."""
+    """Return canonical JSON of an event from its other fields and its payload's canonical JSON."""
     # In canonical JSON the members are sorted by name, and `payload` stands alone between two groups of others.
     before = canonical_parsed({name: value for name, value in fields.items() if name < "payload"})
     after = canonical_parsed({name: value for name, value in fields.items() if name > "payload"})
@@ -111,7 +114,10 @@ def event_text(fields: Mapping[str, Any], payload: str) -> str:
 
 
 def payload_text(payload: Payload) -> str:
-    """Canonical JSON of a payload, its texts storable. Raises StoreError naming a field without a canonical form."""
+    """Return canonical JSON of a payload, its texts storable.
+
+    Raises StoreError naming a field without a canonical form.
+    """
     # In JSON mode pydantic writes NaN in untyped fields as null, which would silently change the evidence.
     for path, number in _numbers(payload.model_dump(mode="python"), payload.kind):
         if not math.isfinite(number):
@@ -147,7 +153,7 @@ def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
 
 
 def references(payload: object) -> tuple[ArtefactRef, ...]:
-    """Every distinct ArtefactRef anywhere in a payload's plain data, in order. Raises StoreError."""
+    """Return every distinct ArtefactRef anywhere in a payload's plain data, in order. Raises StoreError."""
     return tuple(dict.fromkeys(_references(payload)))
 
 
@@ -203,7 +209,7 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
 
 
 def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
-    """Sequence number and hash of a run's last event; (0, 64 zeros) before the first.
+    """Return the sequence number and hash of a run's last event; (0, 64 zeros) before the first.
 
     Raises IntegrityError if the chain does not end where the last append left it.
     """
@@ -220,12 +226,15 @@ def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
 
 
 def read_events(connection: Connection, run_id: str, after_seq: int) -> list[Event]:
-    """The events after a sequence number, in order. Raises IntegrityError for a row that is not a valid event."""
+    """Return the events after a sequence number, in order.
+
+    Raises IntegrityError for a row that is not a valid event.
+    """
     return [to_event(row) for row in connection.execute(_AFTER, {"run": run_id, "after_seq": after_seq})]
 
 
 def to_event(row: Row[Any]) -> Event:
-    """A row as an Event; its hash is not checked. Raises IntegrityError if the row is not a valid event."""
+    """Return a row as an Event; its hash is not checked. Raises IntegrityError if the row is not a valid event."""
     try:
         return Event(
             seq=row.seq,

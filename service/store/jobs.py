@@ -64,7 +64,7 @@ def enqueue(
 
 
 def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Job | None:
-    """The job of a run with this key, or None."""
+    """Return the job of a run with this key, or None."""
     row = connection.execute(
         select(jobs).where(jobs.c.run_id == run_id, jobs.c.idempotency_key == storable(idempotency_key))
     ).one_or_none()
@@ -72,7 +72,7 @@ def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Jo
 
 
 def read_jobs(connection: Connection, run_id: str) -> list[Job]:
-    """All jobs of a run, oldest first."""
+    """Return all jobs of a run, oldest first."""
     return [
         to_job(row)
         for row in connection.execute(select(jobs).where(jobs.c.run_id == run_id).order_by(jobs.c.position))
@@ -80,7 +80,7 @@ def read_jobs(connection: Connection, run_id: str) -> list[Job]:
 
 
 def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> int:
-    """Number of jobs queued or being computed, of one run or of all, in one lane or in both."""
+    """Return the number of jobs queued or being computed, of one run or of all, in one lane or in both."""
     statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
     if run_id is not None:
         statement = statement.where(jobs.c.run_id == run_id)
@@ -97,14 +97,14 @@ def started(connection: Connection, clock: Clock, run_id: str) -> dict[str, str]
 
 @dataclass(frozen=True, slots=True)
 class JobChoice:
-    """Which jobs a worker may claim; None allows every kind, every run, every lane."""
+    """The jobs that a worker may claim; None allows every kind, every run, every lane."""
 
     kinds: Collection[str] | None
     run_id: str | None
     lane: Lane | None
 
     def condition(self) -> ColumnElement[bool]:
-        """The choice as a condition on the rows of `jobs`."""
+        """Return the choice as a condition on the rows of `jobs`."""
         return and_(
             _of_lane(self.lane),
             true() if self.kinds is None else jobs.c.kind.in_(tuple(self.kinds)),
@@ -144,7 +144,10 @@ def claim(
 
 
 def _take_over(connection: Connection, clock: Clock, row: Row[Any]) -> bool:
-    """Whether another worker may have this running job. Records the loss of its worker, and fails it at its limit."""
+    """Return whether another worker may have this running job.
+
+    Records the loss of its worker, and fails the job at its limit of tries.
+    """
     if clock.utc_s() < row.until_utc_s and identity_of(row).life() != "dead":
         return False
     _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
@@ -178,7 +181,7 @@ def finish(connection: Connection, clock: Clock, job: Job, payload: JobFinished)
 
 
 def release(connection: Connection, pids: Collection[int]) -> None:
-    """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
+    """Queue the jobs of these local processes again without counting a try: they were asked to stop and have."""
     here = ProcessIdentity.of_this_process()
     mine = (jobs.c.state == "running", jobs.c.host == here.host, jobs.c.boot == here.boot, jobs.c.pid.in_(pids))
     values = {"state": "queued", "tries": jobs.c.tries - 1, "token": None, "until_utc_s": None}
@@ -213,7 +216,7 @@ def fail(
 
 
 def holds(connection: Connection, job: Job) -> bool:
-    """Whether the lease of a job is still `job.token`."""
+    """Return whether the lease of a job is still `job.token`."""
     row = connection.execute(select(jobs.c.state, jobs.c.token).where(jobs.c.job_id == job.job_id)).one_or_none()
     return row is not None and row.state == "running" and row.token == job.token
 
@@ -245,7 +248,7 @@ def cancel(connection: Connection, clock: Clock, run_id: str, job_id: str, *, ac
 
 
 def held_row(connection: Connection, job: Job) -> Row[Any]:
-    """The row of a job whose lease is still `job.token`. Raises LeaseLostError."""
+    """Return the row of a job whose lease is still `job.token`. Raises LeaseLostError."""
     row = connection.execute(select(jobs).where(jobs.c.job_id == job.job_id)).one_or_none()
     if row is None or row.state != "running" or job.token is None or row.token != job.token:
         state = "gone" if row is None else f"{row.state}, worker {row.worker}"
@@ -304,7 +307,7 @@ def _end(connection: Connection, row: Row[Any], event: Event, *, state: str, err
 
 
 def to_job(row: Row[Any]) -> Job:
-    """A row of `jobs` as a Job."""
+    """Return a row of `jobs` as a Job."""
     return Job(
         job_id=row.job_id,
         run_id=row.run_id,

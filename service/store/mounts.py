@@ -54,7 +54,7 @@ def require_own_mount(folder: Path) -> None:
 
 
 def why_unsafe(folder: Path) -> str:
-    """Why a database in a folder would lose data, in words that follow "the data folder is"; "" if it would not."""
+    """Return why a database in a folder would lose data, to follow "the data folder is"; "" if it would not."""
     return _find(folder.resolve(), folder.stat().st_dev)
 
 
@@ -67,7 +67,7 @@ def _find(folder: Path, _device: int) -> str:
 
 
 def file_system(folder: Path) -> str:
-    """The type of the file system in which an absolute path lies; "" where this system has no table of mounts."""
+    """Return the type of the file system in which an absolute path lies; "" on systems without a table of mounts."""
     found, longest = "", -1
     with suppress(OSError):
         for line in MOUNT_TABLE.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
@@ -80,7 +80,7 @@ def file_system(folder: Path) -> str:
 
 
 def _why_no_locks(folder: Path) -> str:
-    """Return what fails of locks and shared memory where it is tried, in words; "" if nothing does."""
+    """Return a text on what fails of locks and shared memory when tried; "" if nothing does."""
     try:
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".probe-") as one, Path(one.name).open("r+b") as other:
             _lock(one.fileno())

@@ -64,7 +64,7 @@ class Artefact:
     """A recorded artefact: one row of the evidence."""
 
     run_id: str
-    seq: int  # of the event that brought it
+    seq: int  # number of the event that brought it
     position: int
     ref: ArtefactRef
     device: str
@@ -88,7 +88,7 @@ class NewJob:
     arguments: Mapping[str, Any] = field(default_factory=dict[str, Any])
     try_limit: int = 3
     priority: int = WAITED
-    version: int = 1  # of the arguments' form
+    version: int = 1  # version of the arguments' format
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +132,9 @@ class Checkpoint:
     """A signature over a chain, and over its artefact rows, up to one event."""
 
     run_id: str
-    seq: int  # of the last event that it covers
-    sha256: str  # of that event
-    artefacts_sha256: str  # over the rows' record_sha256
+    seq: int  # number of the last event that it covers
+    sha256: str  # hash of that event
+    artefacts_sha256: str  # hash over the rows' record_sha256
     site_seq: int  # end of the site's chain at the time of signing, which tells the valid key
     site_sha256: str
     at_utc: str
@@ -147,7 +147,7 @@ class Timestamp:
     """A time-stamp authority's stamp on a checkpoint (RFC 3161)."""
 
     run_id: str
-    seq: int  # of the checkpoint
+    seq: int  # number of the checkpoint's event
     authority: str  # its address
     at_utc: str  # time of the request; the authority's own time is in the token
     token: str  # base64 of the DER TimeStampResp

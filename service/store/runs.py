@@ -52,7 +52,7 @@ def begin_chain(
 
 
 def read_runs(connection: Connection) -> list[RunRow]:
-    """All runs, oldest first, without the site's chain."""
+    """Return all runs, oldest first, without the site's chain."""
     statement = (
         select(runs, heads.c.seq, heads.c.sha256)
         .outerjoin(heads, heads.c.run_id == runs.c.run_id)
@@ -66,7 +66,7 @@ def read_runs(connection: Connection) -> list[RunRow]:
 
 
 def read_open_runs(connection: Connection) -> set[str]:
-    """Runs that have neither an end recorded by the runner nor an operator's abort, which it confirms later."""
+    """Return runs with neither an end recorded by the runner nor an operator's abort, which it confirms later."""
     ended = (
         select(event_index.c.seq)
         .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
@@ -91,7 +91,7 @@ def read_open_runs(connection: Connection) -> set[str]:
 
 
 def resolve_run(known: Sequence[RunRow], name: str) -> str:
-    """The run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+    """Return the run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
     if not known:
         raise UnknownRunError("there is no run in this data folder yet", remedy="Start one with `orthocapture run`")
     if name == "latest":
@@ -119,7 +119,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ProcessIdentity:
-    """The process that holds a lease, so that another process on the same host can tell whether it is still alive.
+    """The process that holds a lease, so that another process on the same host can see whether it is still alive.
 
     `process_started_s` counts from boot, not from an epoch, so that setting the system clock does not change it.
     """
@@ -131,12 +131,12 @@ class ProcessIdentity:
 
     @classmethod
     def of_this_process(cls) -> ProcessIdentity:
-        """The identity of this process."""
+        """Return the identity of this process."""
         process = psutil.Process()
         return cls(socket.gethostname(), _boot(), process.pid, _started_s(process))
 
     def life(self) -> Literal["lives", "dead", "unknown"]:
-        """Whether the process is alive; unknown for a process on another host. A stopped process is alive."""
+        """Return whether the process is alive; unknown for a process on another host. A stopped process is alive."""
         if self.host != socket.gethostname():
             return "unknown"
         if self.boot != _boot():
@@ -162,12 +162,12 @@ def _started_s(process: psutil.Process) -> float:
 
 
 def identity_of(row: Row[Any]) -> ProcessIdentity:
-    """The holder named in a row of `leases` or `jobs`."""
+    """Return the holder named in a row of `leases` or `jobs`."""
     return ProcessIdentity(row.host, row.boot, row.pid, row.process_started_s)
 
 
 def identity_values(identity: ProcessIdentity) -> dict[str, Any]:
-    """An identity as column values of `leases` or `jobs`."""
+    """Return an identity as column values of `leases` or `jobs`."""
     return {
         "host": identity.host,
         "boot": identity.boot,
@@ -222,20 +222,20 @@ class RunLease:
 
 
 def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
-    """Whether a process that may still be alive holds the lease of a run."""
+    """Return whether a process that may still be alive holds the lease of a run."""
     row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
     return row is not None and is_live(row, clock.utc_s())
 
 
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
-    """Names, sorted, of the runs whose lease is held by a process that may still be alive."""
+    """Return names, sorted, of the runs whose lease is held by a process that may still be alive."""
     now_utc_s = clock.utc_s()
     rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
     return [row.run_id for row in rows if is_live(row, now_utc_s)]
 
 
 def is_live(row: Row[Any], now_utc_s: float) -> bool:
-    """Whether the holder in a row of `leases` or `jobs` may be alive; on another host, until its lease expires."""
+    """Return whether the holder in a row of `leases` or `jobs` may be alive; elsewhere, until the lease expires."""
     life = identity_of(row).life()
     return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
 
@@ -271,7 +271,7 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
 
 
 def _watch(database: Database, clock: Clock, run_id: str, seconds: float) -> tuple[str, float] | None:
-    """The lease of another host that has run out by UTC, once the time in which it would be renewed has passed."""
+    """Return another host's lease that has run out by UTC, once the time in which it would be renewed has passed."""
     with database.reading() as connection:
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
     if row is None or identity_of(row).life() != "unknown" or clock.utc_s() < row.until_utc_s:

@@ -142,7 +142,7 @@ class Store:
         return self._clock
 
     def free_bytes(self) -> int:
-        """Free space in bytes on the disk of the data folder. Raises StoreError."""
+        """Return the free space in bytes on the disk of the data folder. Raises StoreError."""
         try:
             return shutil.disk_usage(self.database_path.parent).free
         except OSError as error:
@@ -188,7 +188,10 @@ class Store:
         )
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The read-only file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
+        """Return the read-only file of an artefact.
+
+        Raises IntegrityError if it is missing or, with `verify`, altered.
+        """
         return self._folder.verified_path(sha256) if verify else self._folder.path(sha256)
 
     # --- runs and events ---
@@ -215,7 +218,7 @@ class Store:
         actor: str,
         software: Mapping[str, str] | None = None,
     ) -> list[Event]:
-        """`record_site` within a transaction of `database.writing()`, so that an action and its record are atomic."""
+        """Do as `record_site` in a transaction of `database.writing()`, so that action and record are atomic."""
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
             opened = SiteOpened(software=dict(software or {}))
             begin_chain(connection, self._clock, self._folder, SITE, opened, actor, ())
@@ -227,17 +230,20 @@ class Store:
         return append(connection, self._clock, run_id, payloads, actor)
 
     def runs(self) -> list[RunRow]:
-        """All runs, oldest first."""
+        """Return all runs, oldest first."""
         with self._database.reading() as connection:
             return read_runs(connection)
 
     def open_runs(self) -> set[str]:
-        """Names of the runs that have not ended, from the index of events without reading them all."""
+        """Return names of the runs that have not ended, from the index of events without reading them all."""
         with self._database.reading() as connection:
             return read_open_runs(connection)
 
     def find_run(self, name: str) -> str:
-        """The run called `name`: a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+        """Return the run called `name`: a full name, an unambiguous beginning, or `latest`.
+
+        Raises UnknownRunError.
+        """
         return resolve_run(self.runs(), name)
 
     def record(
@@ -271,13 +277,16 @@ class Store:
         return events
 
     def events(self, run_id: str, after_seq: int = 0) -> list[Event]:
-        """A run's events after a sequence number, in order. The chain is not verified (verification.verify does)."""
+        """Return a run's events after a sequence number, in order.
+
+        The chain is not verified (verification.verify does).
+        """
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_events(connection, run_id, after_seq)
 
     def first_event(self, run_id: str) -> Event:
-        """A run's first event, without reading the others. Raises IntegrityError if it is missing."""
+        """Return a run's first event, without reading the others. Raises IntegrityError if it is missing."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             row = connection.execute(select(events).where(events.c.run_id == run_id, events.c.seq == 1)).one_or_none()
@@ -286,7 +295,7 @@ class Store:
         return to_event(row)
 
     def head(self, run_id: str) -> int:
-        """Sequence number of a run's last event. Raises UnknownRunError."""
+        """Return the sequence number of a run's last event. Raises UnknownRunError."""
         with self._database.reading() as connection:
             seq: int | None = connection.execute(_HEAD, {"run": run_id}).scalar()
         if seq is None:
@@ -294,24 +303,24 @@ class Store:
         return seq
 
     def artefacts(self, run_id: str) -> list[Artefact]:
-        """All recorded artefacts of a run, in the order of its events."""
+        """Return all recorded artefacts of a run, in the order of its events."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_artefacts(connection, run_id)
 
     def holds(self, run_id: str, sha256: str) -> bool:
-        """Whether a run has recorded a file with this content."""
+        """Return whether a run has recorded a file with this content."""
         found = select(artefacts.c.seq).where(artefacts.c.sha256 == sha256, artefacts.c.run_id == run_id).limit(1)
         with self._database.reading() as connection:
             return connection.execute(found).first() is not None
 
     def checkpoints(self, run_id: str) -> list[Checkpoint]:
-        """All checkpoints of a run's chain, or of the site's (SITE), oldest first; signatures.signing makes them."""
+        """Return all checkpoints of a run's or the site's (SITE) chain, oldest first (made by signatures.signing)."""
         with self._database.reading() as connection:
             return read_checkpoints(connection, run_id)
 
     def timestamps(self, run_id: str) -> list[Timestamp]:
-        """The time stamps on a run's checkpoints, oldest first."""
+        """Return the time stamps on a run's checkpoints, oldest first."""
         with self._database.reading() as connection:
             return read_timestamps(connection, run_id)
 
@@ -322,12 +331,12 @@ class Store:
         return acquire(self._database, self._clock, self._ids, run_id=run_id, holder=holder, seconds=seconds)
 
     def driven(self, run_id: str) -> bool:
-        """Whether a living process holds the lease of a run."""
+        """Return whether a living process holds the lease of a run."""
         with self._database.reading() as connection:
             return is_held(connection, self._clock, run_id)
 
     def driven_runs(self) -> list[str]:
-        """Names of all runs whose lease a living process holds."""
+        """Return names of all runs whose lease a living process holds."""
         with self._database.reading() as connection:
             return held_runs(connection, self._clock)
 
@@ -338,7 +347,7 @@ class Store:
     # --- jobs ---
 
     def jobs(self, run_id: str) -> list[Job]:
-        """All jobs of a run, oldest first."""
+        """Return all jobs of a run, oldest first."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return queue.read_jobs(connection, run_id)
@@ -349,7 +358,7 @@ class Store:
             return queue.started(connection, self.clock, run_id)
 
     def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
-        """Number of jobs of a run, or of all runs, that are queued or being computed.
+        """Return the number of jobs of a run, or of all runs, that are queued or being computed.
 
         `lane` counts only jobs that a person or a step waits for ("waited"), or only the others ("background").
         """
@@ -438,7 +447,7 @@ class Store:
         return events
 
     def holds_job(self, job: Job) -> bool:
-        """Whether a claimed job is still this worker's: not cancelled, not failed, not taken over."""
+        """Return whether a claimed job is still this worker's: not cancelled, not failed, not taken over."""
         with self._database.reading() as connection:
             return queue.holds(connection, job)
 
@@ -454,7 +463,7 @@ class Store:
         return event
 
     def release_jobs(self, pids: Collection[int]) -> None:
-        """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
+        """Queue the jobs of these local processes again without counting a try: they were asked to stop and have."""
         with self._database.writing() as connection:
             queue.release(connection, pids)
 

@@ -50,7 +50,7 @@ _WITH_STATIC_FILES = ("audit", "calibration", "capture", "dataset", "handheld", 
 
 
 def create_app(site: Site) -> FastAPI:
-    """The application over one data folder."""
+    """Return the application over one data folder."""
     app = FastAPI(
         title="orthocapture",
         docs_url=None,

@@ -51,7 +51,7 @@ class Connection:
         return 2 * self.known + (self.answering > 0)
 
     def stop_waiting(self) -> None:
-        """The request has arrived, or the connection is gone."""
+        """Stop the wait: the request has arrived, or the connection is gone."""
         if self.timer is not None:
             self.timer.cancel()
             self.timer = None
@@ -74,7 +74,7 @@ class Connections:
     """
 
     def __init__(self, limits: ConnectionLimits, *, without_limit: Container[str] = ()) -> None:
-        """`without_limit`: addresses that stand for many clients; only the limit in all counts for them."""
+        """Hold none yet; `without_limit`: addresses of many clients, for which only the limit in all counts."""
         self.limits = limits
         self._without_limit = without_limit
         self._open: dict[Peer, Connection] = {}
@@ -94,11 +94,11 @@ class Connections:
         return connection
 
     def find(self, peer: Peer) -> Connection | None:
-        """The connection that a request came by, while it lasts."""
+        """Return the connection that a request came by, while it lasts."""
         return self._open.get(peer)
 
     def leave(self, connection: Connection) -> None:
-        """Its socket is closed."""
+        """Forget a connection whose socket is closed."""
         connection.stop_waiting()
         if self._open.get(connection.peer) is connection:
             del self._open[connection.peer]
@@ -151,7 +151,7 @@ class Connections:
 
 
 def plain_address(text: str) -> str:
-    """An address in its usual form, so that one client has one name: ::ffff:10.0.0.7 is 10.0.0.7."""
+    """Return an address in its usual form, so that one client has one name: ::ffff:10.0.0.7 is 10.0.0.7."""
     try:
         address = ip_address(text)
     except ValueError:
@@ -182,7 +182,7 @@ class OpenStreams:
 
     @contextmanager
     def opened(self, screen: str) -> Generator[OpenStream]:
-        """A place among the streams of a sign-in, for as long as it lasts."""
+        """Yield a place among the streams of a sign-in, for as long as it lasts."""
         count = Counter(stream.screen for stream in self._open)
         if count[screen] >= self._per_screen:
             self._end_oldest(screen)
@@ -243,7 +243,7 @@ class Listener(socket.socket):
 
 
 class _AcceptedSocket(socket.socket):
-    """An accepted socket that tells when it is closed."""
+    """An accepted socket that reports when it is closed."""
 
     def __init__(self, plain: socket.socket, wait_s: float) -> None:
         super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
@@ -264,10 +264,10 @@ class _AcceptedSocket(socket.socket):
 
 
 def _nothing() -> None:
-    """Stand in until somebody asks to be told that a connection was closed."""
+    """Stand in until somebody asks for a call when a connection is closed."""
 
 
 def affordable_connections(wanted: int) -> int:
-    """The wanted number of connections, at most half of the files that this process may open."""
+    """Return the wanted number of connections, at most half of the files that this process may open."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))

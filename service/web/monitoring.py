@@ -53,7 +53,7 @@ class RequestCounts:
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request and count it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -103,11 +103,11 @@ class DataFolderMetrics(Collector):
         self._health = health
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing, so that registering the collector does not read the database."""
+        """Return nothing, so that registering the collector does not read the database."""
         return ()
 
     def collect(self) -> Iterable[Metric]:
-        """One scrape."""
+        """Yield the metrics of one scrape."""
         health = self._health()
         parts = {
             "database": health.database,
@@ -290,7 +290,10 @@ def _driven(site: Site) -> list[str]:
 
 @router.get("/health", name="health")
 def health(site: CurrentSite) -> JSONResponse:
-    """Health of database, data folder, workers, runners and second place. Status 200 if all are well, else 503."""
+    """Show the health of database, data folder, workers, runners and second place.
+
+    Status 200 if all are well, else 503.
+    """
     found = read_health(site.store, site.data, _driven(site), site.second_place.away)
     parts = {
         "database": found.database,
@@ -305,6 +308,6 @@ def health(site: CurrentSite) -> JSONResponse:
 
 @router.get("/metrics", name="metrics", dependencies=[Depends(ReaderOrLocalRequest("read", while_locked=False))])
 def metrics(request: Request) -> Response:
-    """The figures for Prometheus."""
+    """Show the figures for Prometheus."""
     content = generate_latest(cast(CollectorRegistry, request.app.state.metrics))
     return Response(content, media_type=CONTENT_TYPE_LATEST)

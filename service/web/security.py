@@ -77,7 +77,7 @@ class Shield:
         self._hosts = frozenset(_host_name(host) for host in hosts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request, or refuse it by its host, size or headers."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -166,7 +166,7 @@ class Limiter:
         window_s: float = TRIES_WINDOW_S,
         addresses: int = 10_000,
     ) -> None:
-        """`failed_tries`: address and age in s of failed tries before the service started, oldest first."""
+        """Start with the `failed_tries` from before the service started: address and age in s, oldest first."""
         self._clock = clock
         self._tries = tries
         self._window_s = window_s
@@ -210,7 +210,7 @@ _log = logging.getLogger("orthocapture.web")
 
 
 async def sealed(request: Request, site: CurrentSite) -> AsyncGenerator[None]:
-    """Dependency of all routes (`scope="function"`): signs before the answer is sent, also for refused requests.
+    """Sign before the answer is sent, also for refused requests; a dependency of all routes (`scope="function"`).
 
     Only requests such as POST need it: accounts, invitations, sign-ins and signatures, refused ones included.
     """
@@ -243,7 +243,7 @@ THEFT_REMEDY = "Load the page again and repeat; nothing was done"
 
 
 def cookie_name(site: Site) -> str:
-    """Browsers accept the prefix only from a secure origin, for the whole host, and from no other host."""
+    """Return the cookie's name; browsers accept the prefix from a secure origin only, for exactly this host."""
     return "__Host-orthocapture" if site.secure else "orthocapture"
 
 
@@ -258,7 +258,7 @@ def clear_cookie(response: Response, site: Site) -> None:
 
 
 def token_of(request: Request, site: Site) -> str:
-    """The token that came with a request; "" for none."""
+    """Return the token that came with a request; "" for none."""
     return request.cookies.get(cookie_name(site), "")
 
 
@@ -308,11 +308,11 @@ class Guard:
 
 
 def requires(permission: Permission, *, while_locked: bool | tuple[str, ...] = False) -> Guard:
-    """The guard of a route: `dependencies=[Depends(requires("read"))]`.
+    """Return the guard of a route: `dependencies=[Depends(requires("read"))]`.
 
     Args:
-        permission: of service.people.person.
-        while_locked: whether a locked screen may do it too; or the values of the form field `verb` that it may do.
+        permission: a permission of service.people.person.
+        while_locked: true if a locked screen may do it too; or the values of the form field `verb` that it may do.
     """
     return Guard(permission, while_locked)
 
@@ -328,7 +328,7 @@ SignedInPerson = Annotated[Person, Depends(_signed)]
 
 
 def controls(run_id: str, person: SignedInPerson, site: CurrentSite) -> None:
-    """Dependency of routes that act on a run: this screen must have control of it. Raises ControlError."""
+    """Require that this screen controls the run; a dependency of routes that act on one. Raises ControlError."""
     Control(site.store).require(run_id, person)
 
 

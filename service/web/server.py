@@ -42,7 +42,7 @@ class Reception:
         self._connections = connections
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request."""
         client: tuple[str, int] | None = scope.get("client")
         connection = self._connections.find((client[0], client[1])) if client else None
         if scope["type"] != "http" or connection is None:
@@ -87,12 +87,12 @@ class ForwardedClient:
     """The client's address and scheme as a proxy forwards them, believed from known proxies alone."""
 
     def __init__(self, app: ASGIApp, proxies: frozenset[str]) -> None:
-        """`proxies`: addresses as `plain_address` writes them."""
+        """Believe the `proxies` only, addresses as `plain_address` writes them."""
         self._app = app
         self._proxies = proxies
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Serve one request."""
         client: tuple[str, int] | None = scope.get("client")
         if scope["type"] == "http" and client:
             address, port = plain_address(client[0]), client[1]
@@ -119,7 +119,7 @@ class ForwardedClient:
 
 
 def _address(entry: str) -> str:
-    """The address of an entry, which may have a port; "" for anything else."""
+    """Return the address of an entry, which may have a port; "" for anything else."""
     if entry.startswith("["):
         entry = entry[1:].partition("]")[0]
     elif entry.count(":") == 1:
@@ -140,7 +140,7 @@ Kind = tuple[str | int, ...]
 
 @dataclass(slots=True)
 class _Repeats:
-    """What was said of one kind since `since_s`."""
+    """The messages of one kind since `since_s`."""
 
     since_s: float
     name: str
@@ -185,7 +185,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
             self.release()
 
     def close(self) -> None:
-        """Say how many were left out at all."""
+        """Say how many messages were left out in all."""
         self._tell(float("inf"))
         super().close()
 
@@ -198,7 +198,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
 
 
 def told(record: logging.LogRecord) -> bool:
-    """Whether the sparing handler, which comes first, has not left this message out."""
+    """Return whether the sparing handler, which comes first, wrote this message rather than leave it out."""
     return not vars(record).get(_LEFT_OUT)
 
 
@@ -214,7 +214,7 @@ def _kind(record: logging.LogRecord) -> Kind:
 
 @contextmanager
 def sparing_log(clock: Clock) -> Generator[SparingHandler]:
-    """All messages of this process go through one such handler to stderr, and through no other."""
+    """Send all messages of this process through one such handler to stderr, and through no other."""
     handler = SparingHandler(sys.stderr, clock)
     root = logging.getLogger()
     usual = root.handlers[:]
@@ -231,7 +231,10 @@ def sparing_log(clock: Clock) -> Generator[SparingHandler]:
 
 
 def known_proxies(addresses: Sequence[str]) -> frozenset[str]:
-    """The addresses of trusted proxies in their usual form. Raises ConfigurationError for what is not an address."""
+    """Return the addresses of trusted proxies in their usual form.
+
+    Raises ConfigurationError for what is not an address.
+    """
     for address in addresses:
         try:
             ip_address(address)
@@ -246,7 +249,7 @@ def known_proxies(addresses: Sequence[str]) -> frozenset[str]:
 
 @contextmanager
 def listening(host: str, port: int, limits: ConnectionLimits, proxies: frozenset[str]) -> Generator[Listener]:
-    """The socket, bound before anything is recorded: a second server on the port changes nothing."""
+    """Yield the socket, bound before anything is recorded: a second server on the port changes nothing."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with Listener(family, Connections(limits, without_limit=proxies)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -265,7 +268,7 @@ def listening(host: str, port: int, limits: ConnectionLimits, proxies: frozenset
 def server(
     app: FastAPI, listener: Listener, proxies: frozenset[str], tls: tuple[Path, Path] | None, log: SparingHandler
 ) -> Server:
-    """The server of an application on a socket."""
+    """Return the server of an application on a socket."""
     config = uvicorn.Config(
         Reception(ForwardedClient(app, proxies), listener.connections),
         loop="asyncio",  # its servers accept through the listener
@@ -286,11 +289,11 @@ def server(
 
 
 class Server(uvicorn.Server):
-    """Ends in order when told to; uvicorn's own would raise the signal again, past what is left to do here."""
+    """A server that ends in order; uvicorn's own would raise the signal again, past what is left to do here."""
 
     @contextmanager
     def capture_signals(self) -> Generator[None]:
-        """Ctrl-C and SIGTERM end the server."""
+        """Let Ctrl-C and SIGTERM end the server."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self.handle_exit)
         yield

@@ -37,7 +37,7 @@ class Launcher:
     _lock: Lock = field(default_factory=Lock)
 
     def driven(self, run_id: str) -> bool:
-        """Whether a living process drives the run, or one has just been started to do so."""
+        """Return whether a living process drives the run, or one has just been started to do so."""
         with self._lock:
             child = self._children.get(run_id)
             if child is not None and child.poll() is None:
@@ -45,7 +45,7 @@ class Launcher:
         return self.store.driven(run_id)
 
     def driven_runs(self) -> list[str]:
-        """All runs of which `driven` is true, by name."""
+        """Return all runs of which `driven` is true, by name."""
         with self._lock:
             started = {run_id for run_id, child in self._children.items() if child.poll() is None}
         return sorted(started.union(self.store.driven_runs()))
@@ -91,10 +91,10 @@ class OpenedRuns:
     _runs: dict[str, RunFollower] = field(init=False, default_factory=dict[str, RunFollower])
     # A lock exists only while somebody uses it, so that invented names of runs leave nothing behind.
     _locks: WeakValueDictionary[str, Lock] = field(init=False, default_factory=WeakValueDictionary[str, Lock])
-    _lock: Lock = field(init=False, default_factory=Lock)  # of the two above; held for moments
+    _lock: Lock = field(init=False, default_factory=Lock)  # lock of the two above; held for moments
 
     def now(self, run_id: str) -> RunRecord:
-        """A run's record as of now. Raises what `first_read` raises, and IntegrityError."""
+        """Return a run's record as of now. Raises what `first_read` raises, and IntegrityError."""
         with self._lock:
             run = self._runs.get(run_id)
             lock = self._locks.setdefault(run_id, Lock())
@@ -115,7 +115,7 @@ class Site:
     store: Store
     people: People
     launcher: Launcher
-    devices_of: Callable[[Rig], Mapping[str, RigDevice]]  # of a rig file, by name
+    devices_of: Callable[[Rig], Mapping[str, RigDevice]]  # returns the devices of a rig file, by name
     secure: bool = True  # cookies are sent over TLS, or to this machine, only
     idle_lock_s: float = 600.0
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
@@ -130,11 +130,14 @@ class Site:
         self.second_place = second_place(self.rig, self.store)
 
     def run(self, run_id: str) -> RunRecord:
-        """A run's record as of now. Raises UnknownRunError, IntegrityError."""
+        """Return a run's record as of now. Raises UnknownRunError, IntegrityError."""
         return self.runs.now(run_id)
 
     def step_times(self, run_id: str) -> EarlierTimes:
-        """How long the steps took in the runs before this one; read once. Raises UnknownRunError, StoreError."""
+        """Return how long the steps took in the runs before this one; read once.
+
+        Raises UnknownRunError, StoreError.
+        """
         if run_id not in self._step_times:
             from service.monitor.figures import read_step_times  # noqa: PLC0415 - of runs under way only
 
@@ -142,7 +145,7 @@ class Site:
         return self._step_times[run_id]
 
     def protocol_files(self) -> list[Path]:
-        """Protocols that can be started."""
+        """Return protocols that can be started."""
         return sorted(self.protocols.glob("*.yaml"))
 
     def _first_read(self, run_id: str) -> RunFollower:

@@ -73,12 +73,12 @@ class BundleZip:
 
 @contextmanager
 def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | None = None) -> Generator[BundleZip]:
-    """A zip file that gets its name only when it is complete and durable; otherwise nothing is left of it.
+    """Yield a zip file that gets its name only when it is complete and durable; otherwise nothing is left of it.
 
     Args:
         target: the file.
         at: time stamp of its entries.
-        leaving: called with the complete file before it gets its name; if it raises, no file appears.
+        leaving: a function called with the complete file before it gets its name; if it raises, no file appears.
 
     Raises:
         DataError: a file of this name exists.
@@ -144,19 +144,19 @@ devices told the truth, or that nobody but the site had the key.
 
 
 def readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -> str:
-    """The text of README.txt.
+    """Return the text of README.txt.
 
     Args:
-        run_id: of the run.
+        run_id: the run's identifier.
         key_id: fingerprint of the site's signing key.
         root: the run's first event.
-        missing: results that have not arrived yet, in words.
+        missing: texts on results that have not arrived yet.
     """
     return _TEXT.format(run_id=run_id, key_id=key_id, warnings=_warnings(root, missing))
 
 
 def _warnings(root: RunStarted, missing: Sequence[str]) -> str:
-    """Paragraphs on a simulated rig, imported images and missing results; each ends with an empty line."""
+    """Return paragraphs on a simulated rig, imported images and missing results; each ends with an empty line."""
     found: list[str] = []
     if root.simulated:
         found.append("SIMULATED: no real device took part in this run. It is not a record of a real acquisition.")
@@ -195,11 +195,11 @@ class BundledRun:
     """A run as one transaction sees it.
 
     Attributes:
-        head: of the run's chain.
-        site_head: of the site's chain.
+        head: the head of the run's chain.
+        site_head: the head of the site's chain.
         artefacts: every recorded file, once for each event that brought it.
-        full_names: of accounts.
-        missing: results that have not arrived yet, in words.
+        full_names: people's full names, by account.
+        missing: texts on results that have not arrived yet.
         keys: the site's public keys, oldest first.
     """
 

@@ -41,7 +41,7 @@ _DESCRIPTIONS = {
 
 
 def crate_json(run: BundledRun, files: Sequence[ManifestEntry]) -> bytes:
-    """The metadata as canonical JSON. `files`: those in the bundle, which may lack recorded files."""
+    """Return the metadata as canonical JSON. `files`: those in the bundle, which may lack recorded files."""
     described = _artefact_entities(run.artefacts, {item.path for item in files})
     ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
     own = [
@@ -85,7 +85,7 @@ def _dataset(run: BundledRun) -> dict[str, Any]:
 
 
 def _about(root: RunStarted, dataset: dict[str, Any]) -> list[dict[str, Any]]:
-    """The metadata file, the data set, the rights and the software, in the order of the graph."""
+    """Return the metadata file, the data set, the rights and the software, in the order of the graph."""
     return [
         descriptor(),
         dataset,
@@ -120,7 +120,7 @@ def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list
 
 
 def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
-    """Every device as it first answered."""
+    """Yield every device as it first answered."""
     opened: dict[str, DeviceOpened] = {}
     for event in events:
         if isinstance(event.payload, DeviceOpened):
@@ -185,7 +185,7 @@ def _links(refs: Iterable[ArtefactRef], ids: Mapping[str, str]) -> list[dict[str
 
 
 def _named(arguments: Mapping[str, Any], ids: Mapping[str, str]) -> list[dict[str, str]]:
-    """The recorded files that a job's arguments name, as references or by their hash alone."""
+    """Return the recorded files that a job's arguments name, as references or by their hash alone."""
     found = {ref.sha256: None for ref in references(arguments)} | dict.fromkeys(_hashes(arguments, ids))
     return [{"@id": ids[sha256]} for sha256 in found if sha256 in ids]
 

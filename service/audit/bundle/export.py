@@ -68,7 +68,7 @@ ReportMaker = Callable[[AuditReport, int], bytes]  # (result of the verification
 
 
 def marked_name(name: str, *, simulated: bool) -> str:
-    """The name of an exported file; for a simulated run it contains SIMULATED."""
+    """Return the name of an exported file; for a simulated run it contains SIMULATED."""
     if not simulated or MARK in name:
         return name
     stem, dot, suffix = name.rpartition(".")
@@ -141,7 +141,7 @@ def export_bundle(
         actor: the person who exports.
         hashes_only: leave out the recorded files; their hashes are in the records.
         report: makes an HTML report to be included.
-        progress: called with the activity, the bytes done and the total.
+        progress: a function that is called with the activity, the bytes done and the total.
 
     Raises:
         IntegrityError: the evidence does not verify. Nothing was written.
@@ -203,14 +203,14 @@ def _add_manifest(bundle: BundleZip, store: Store, run: BundledRun, *, hashes_on
 
 
 def _zip_time(at_utc: str) -> ZipTime:
-    """The time of the last event, so that the same evidence gives the same bytes; zip has no odd seconds."""
+    """Return the time of the last event, so that the same evidence gives the same bytes; zip has no odd seconds."""
     year, month, day = (int(part) for part in at_utc[:10].split("-"))
     hour, minute, second = (int(part) for part in at_utc[11:19].split(":"))
     return max(year, 1980), month, day, hour, minute, second - second % 2
 
 
 def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[AuditReport, int], bytes]:
-    """Returns a function that makes the HTML report of a run up to an event from the result of its verification.
+    """Return a function that makes the HTML report of a run up to an event from the result of its verification.
 
     The report is dated by the last event in the bundle, so that the same evidence gives the same bytes.
     """

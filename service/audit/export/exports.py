@@ -60,7 +60,7 @@ class _Sent(io.RawIOBase):
 
 
 def zip_chunks(folder: Path, sums_sha256: str) -> Iterator[bytes]:
-    """The bytes of the zip file: the files that SHA256SUMS lists, and SHA256SUMS last.
+    """Yield the bytes of the zip file: the files that SHA256SUMS lists, and SHA256SUMS last.
 
     Args:
         folder: an exported data set.
@@ -83,7 +83,7 @@ def zip_chunks(folder: Path, sums_sha256: str) -> Iterator[bytes]:
 
 
 def _entry(archive: zipfile.ZipFile, sent: _Sent, folder: Path, name: str, sha256: str) -> Iterator[bytes]:
-    """One file, read without following links."""
+    """Yield one file, read without following links."""
     inside = PurePosixPath(name)
     if inside.is_absolute() or ".." in inside.parts:
         raise _altered(name)
@@ -154,7 +154,10 @@ class Exports:
         return self._data / FOLDER
 
     def state(self, run_id: str) -> ChildState | None:
-        """The state of a run's present or last export; its result is the file's name. None before the first."""
+        """Return the state of a run's present or last export; its result is the file's name.
+
+        None before the first.
+        """
         return self._children.state(run_id)
 
     def start(self, run_id: str, export: What, by: str) -> None:
@@ -192,11 +195,11 @@ class Exports:
         self._children.wait(run_id, timeout_s)
 
     def unfinished(self, run_id: str) -> list[UnfinishedExport]:
-        """Exports in a format that were begun and have not ended, newest first."""
+        """Return exports in a format that were started and have not ended, newest first."""
         return unfinished_exports(self.folder, run_id)
 
     def files(self, events: Sequence[Event]) -> list[ExportedFile]:
-        """Every export of a run, newest first."""
+        """Return every export of a run, newest first."""
         found = [
             ExportedFile(e.seq, e.at_utc, e.actor, e.payload, self._path(e.payload) is not None)
             for e in events
@@ -205,7 +208,7 @@ class Exports:
         return found[::-1]
 
     def path(self, events: Sequence[Event], file_name: str) -> tuple[Path, EvidenceExported]:
-        """A file or folder for download, by its recorded name. Raises DataError for any other name."""
+        """Return a file or folder for download, by its recorded name. Raises DataError for any other name."""
         for file in self.files(events):
             path = self._path(file.record) if file.record.file_name == file_name else None
             if path is not None:
@@ -217,7 +220,7 @@ class Exports:
         )
 
     def _path(self, record: EvidenceExported) -> Path | None:
-        """The file, or the folder of a data set, if it exists with the recorded size (of its list of checksums).
+        """Return the file, or a data set's folder, if it exists with the recorded size (of its list of checksums).
 
         Names that lead out of the folder are refused, and so are links.
         """
@@ -269,7 +272,7 @@ _KEY = ""  # the list belongs to no run
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: its name, and what it is in words."""
+    """A format: its name, and a text on what it is."""
 
     name: str
     words: str
@@ -282,11 +285,14 @@ class Formats:
         self._children = ChildProcesses("service.audit.export.exports", "list of formats", clock)
 
     def state(self) -> ChildState | None:
-        """The progress or the outcome of the listing; None before it was begun."""
+        """Return the progress or the outcome of the listing; None before it was started."""
         return self._children.state(_KEY)
 
     def known(self, wait_s: float = 0.0) -> tuple[Format, ...]:
-        """The formats in the order of their names; empty while they are not known. Begins to list them once."""
+        """Return the formats in the order of their names; empty while they are not known.
+
+        Begins to list them once.
+        """
         if self.state() is None:
             self._children.start(_KEY, (), by="")
         if wait_s:
@@ -296,7 +302,7 @@ class Formats:
 
 
 def listed(_progress: Progress) -> list[dict[str, str]]:
-    """The formats as plain data. Raises ConfigurationError."""
+    """Return the formats as plain data. Raises ConfigurationError."""
     from service.dataset.exporter import exporters  # noqa: PLC0415 - see above
 
     return [{"name": name, "words": how.words} for name, how in sorted(exporters().items())]

@@ -35,7 +35,7 @@ def export_data_set(
         wanted: format and options.
         target: the folder, which appears when it is whole. An interrupted export goes on.
         actor: the person who exports.
-        progress: called with the activity, the amount done and the total.
+        progress: a function that is called with the activity, the amount done and the total.
 
     Raises:
         ConfigurationError: there is no such format or crop, or another process writes this folder.
@@ -70,7 +70,7 @@ def export_data_set(
 
 
 def crop_size(text: str) -> tuple[int, int] | None:
-    """Width and height of `WIDTHxHEIGHT`; None for "", which is whole images.
+    """Return the width and height of `WIDTHxHEIGHT`; None for "", which is whole images.
 
     Raises:
         ConfigurationError: it is not a size.
@@ -96,7 +96,7 @@ def require_version(version: str) -> None:
 def _cropped(
     dataset: DataSet, summary: RunSummary, how: Exporter, size: tuple[int, int], wanted: WantedExport
 ) -> DataSet:
-    """Parts of the pictures as the format has them: undistorted ones are cut after they were undistorted."""
+    """Return parts of the pictures as the format has them: undistorted ones are cut after they were undistorted."""
     personal = not wanted.anonymous
     whole = undistorted_data_set(dataset, personal=personal) if how.pinhole else dataset
     return cropped_data_set(whole, partial(specimen_pixels, summary), size, most=wanted.crops, personal=personal)

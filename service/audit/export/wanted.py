@@ -1,4 +1,4 @@
-"""What a person asked to have exported, kept beside an unfinished export so that it can go on later."""
+"""What a person asked to have exported, stored beside an unfinished export so that it can go on later."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class WantedExport:
     Attributes:
         form: name of the format.
         crop: `WIDTHxHEIGHT` in pixels; "" for whole images or, where several crops are wanted, for 1920x1080.
-        crops: of each image, at most.
+        crops: the largest number of crops of each image.
         anonymous: GPS, owner and serial numbers are left out of the pictures, people and serial numbers out of
             the metadata, and the scanner's own files out of the folder.
         stated: title, licence, ethics, creators and citation; they replace those of the protocol.
-        version: of the data set, MAJOR.MINOR.PATCH.
+        version: the data set's version, MAJOR.MINOR.PATCH.
     """
 
     form: str
@@ -53,7 +53,7 @@ class WantedExport:
 
 @dataclass(frozen=True, slots=True)
 class ExportRequest:
-    """Who wants what of which run."""
+    """A person's request for an export of a run."""
 
     run_id: str
     wanted: WantedExport
@@ -63,7 +63,7 @@ class ExportRequest:
 
 @dataclass(frozen=True, slots=True)
 class UnfinishedExport:
-    """An export that was begun and has not ended; `writing`: a process is at it."""
+    """An export that was started and has not ended; `writing`: a process is at it."""
 
     name: str
     request: ExportRequest
@@ -82,7 +82,7 @@ def keep_request(target: Path, request: ExportRequest) -> None:
 
 
 def kept_request(target: Path) -> ExportRequest:
-    """The request beside a folder.
+    """Return the request beside a folder.
 
     Raises:
         DataError: there is none that can be read.
@@ -108,7 +108,7 @@ def discard_unfinished(target: Path) -> None:
 
 
 def unfinished_exports(folder: Path, run_id: str) -> list[UnfinishedExport]:
-    """The unfinished exports of a run in a folder of exports, the newest first."""
+    """Return the unfinished exports of a run in a folder of exports, the newest first."""
     found: list[UnfinishedExport] = []
     for path in sorted(folder.glob(f".{run_id}*{_WANTED}"), reverse=True):
         target = folder / path.name.removeprefix(".").removesuffix(_WANTED)

@@ -19,12 +19,12 @@ class OpenedDevice:
     """A device as it answered when it was opened."""
 
     row: EventRow  # its device_opened event
-    name: str  # in rig.yaml
+    name: str  # the name in rig.yaml
     report: RecordedReport
 
 
 def opened_devices(rows: Iterable[EventRow]) -> list[OpenedDevice]:
-    """The devices of some device_opened events, read with their payloads."""
+    """Return the devices of some device_opened events, read with their payloads."""
     opened = ((row, row.record(DeviceOpened)) for row in rows)
     return [
         OpenedDevice(row, known.device, recorded_report(known.report)) for row, known in opened if known is not None
@@ -32,7 +32,7 @@ def opened_devices(rows: Iterable[EventRow]) -> list[OpenedDevice]:
 
 
 def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[OpenedDevice]) -> CameraBodies:
-    """Serial numbers of the cameras among the opened devices."""
+    """Return serial numbers of the cameras among the opened devices."""
     rows = connection.execute(
         text(
             "SELECT DISTINCT json_extract(e.payload, '$.camera.body_serial') AS body "
@@ -51,7 +51,7 @@ class ClockSeries:
     """The offset of a device's clock from the host's over a step, as far as one start of the runner did it."""
 
     step: str
-    start: int  # of the runner in this run, counted from 1
+    start: int  # the runner's start in this run, counted from 1
     captures: int
     first_s: float
     last_s: float
@@ -66,9 +66,9 @@ class ClockSeries:
 
 
 def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
-    """The robot controller's clock minus the host's monotonic one, as every capture recorded it.
+    """Return the robot controller's clock minus the host's monotonic one, as every capture recorded it.
 
-    Each start of the runner has a series of its own: the host's monotonic clock begins anew with every boot.
+    Each start of the runner has a series of its own: the host's monotonic clock starts again with every boot.
     """
     rows = connection.execute(
         text(
@@ -109,11 +109,11 @@ class Session:
 
     row: EventRow
     software: Mapping[str, str]
-    changed: Mapping[str, tuple[str, str]]  # since the session before: distribution → before, now
+    changed: Mapping[str, tuple[str, str]]  # changes since the session before: distribution → before, now
 
 
 def sessions(rows: Sequence[EventRow]) -> list[Session]:
-    """The starts of a runner, each compared with the one before."""
+    """Return the starts of a runner, each compared with the one before."""
     found: list[Session] = []
     before: dict[str, str] | None = None
     for row in rows:

@@ -61,12 +61,12 @@ class Digest:
     protocol: Protocol | None = None
     state: RunState | None = None  # None if the protocol cannot be read
     failed_gates: list[FailedGate] = field(default_factory=list[FailedGate])
-    times: dict[int, str] = field(default_factory=dict[int, str])  # of deviations and automatic confirmations
+    times: dict[int, str] = field(default_factory=dict[int, str])  # times of deviations and automatic confirmations
     facets: Facets = field(default_factory=Facets)
     problem: str = ""  # why the fold stopped before the end of the chain; "" if it did not
 
     def copy(self) -> Digest:
-        """A copy that can be continued while pages read this one."""
+        """Return a copy that can be continued while pages read this one."""
         return replace(self, failed_gates=list(self.failed_gates), times=dict(self.times), facets=self.facets.copy())
 
     @property
@@ -104,7 +104,7 @@ class Digest:
 
 
 def digests(store: Store) -> IncrementalResults[Digest]:
-    """Digests of a data folder's runs, kept up to date in the background."""
+    """Return digests of a data folder's runs, updated in the background."""
     return IncrementalResults(store, lambda run_id, before: step(store, run_id, before), "digest")
 
 
@@ -141,7 +141,7 @@ def _begin(digest: Digest, store: Store, connection: Connection) -> None:
 
 
 def _chunk_end(connection: Connection, run_id: str, after: int, last: int) -> int:
-    """The last event of the next chunk. The chunk's size counts only events that the digest reads."""
+    """Return the last event of the next chunk. The chunk's size counts only events that the digest reads."""
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND seq > :after "
@@ -252,7 +252,7 @@ class Shots:
 
 
 def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, int]) -> list[Shots]:
-    """The photographs of each step that took any or tried to. `failures`: number of failed exposures by step."""
+    """Return the photographs of each step that took any or tried to; `failures`: failed exposures by step."""
     found: list[Shots] = []
     for step in protocol.steps:
         now = state.steps[step.id]
@@ -267,14 +267,14 @@ def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, in
 
 
 def shots_of(digest: Digest | None, failures: Mapping[str, int]) -> list[Shots]:
-    """`shots_by_step` of a digest; empty while there is none."""
+    """Return `shots_by_step` of a digest; empty while there is none."""
     if digest is None or digest.protocol is None or digest.state is None:
         return []
     return shots_by_step(digest.protocol, digest.state, failures)
 
 
 def together(shots: Sequence[Shots]) -> Shots:
-    """The photographs of all steps together."""
+    """Return the photographs of all steps together."""
     return Shots(
         "",
         "Together",
@@ -286,7 +286,7 @@ def together(shots: Sequence[Shots]) -> Shots:
 
 
 def failed_exposures(events: Sequence[Event]) -> dict[str, int]:
-    """The number of failed exposures of each step."""
+    """Return the number of failed exposures of each step."""
     found: dict[str, int] = {}
     for event in events:
         if isinstance(event.payload, ViewpointFailed):
@@ -295,7 +295,7 @@ def failed_exposures(events: Sequence[Event]) -> dict[str, int]:
 
 
 def failed_exposures_of(connection: Connection, run_id: str) -> dict[str, int]:
-    """The number of failed exposures of each step, counted in the database without reading the events."""
+    """Return the number of failed exposures of each step, counted in the database without reading the events."""
     rows = connection.execute(
         text(
             "SELECT step, count(*) AS n FROM event_index "

@@ -38,7 +38,7 @@ class CorrectedValue:
     old: Any
     new: Any
     reason: str
-    original: Any  # what the event holds; equals `old`
+    original: Any  # the value in the event; equals `old`
     latest: bool  # no later correction of the same value
 
     @property
@@ -53,7 +53,7 @@ class CorrectedValue:
 
 
 def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue]:
-    """All corrections of a run, in order."""
+    """Return all corrections of a run, in order."""
     rows = read_rows(
         connection, run_id, seqs_of_kind(connection, run_id, ["record_corrected"], limit=LISTED), whole=True
     )
@@ -83,12 +83,12 @@ def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue
 
 
 def value_text(value: Any) -> str:
-    """A value as text: strings unchanged, anything else as JSON."""
+    """Return a value as text: strings unchanged, anything else as JSON."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def value_at(payload: Mapping[str, Any], path: str) -> Any:
-    """The value at a path such as environment.light_lux or verdicts.0.value; None if there is none."""
+    """Return the value at a path such as environment.light_lux or verdicts.0.value; None if there is none."""
     value: Any = payload
     for part in path.split("."):
         if isinstance(value, Mapping) and part in value:
@@ -102,12 +102,12 @@ def value_at(payload: Mapping[str, Any], path: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """What one attempt of a step measured."""
+    """The measures of one attempt of a step."""
 
     attempt: int
     seq: int
     at_utc: str
-    measures: Mapping[str, str]  # as text, with bounds if the measure states any
+    measures: Mapping[str, str]  # measures as text, with bounds if the measure states any
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class ReplacedStep:
     """A step that was done more than once, with the measures of every attempt."""
 
     step: str
-    reasons: Sequence[tuple[int, str]]  # for each superseded attempt: the event, and why
+    reasons: Sequence[tuple[int, str]]  # event and reason of each superseded attempt
     attempts: Sequence[Attempt]
 
     @property
@@ -125,7 +125,7 @@ class ReplacedStep:
 
 
 def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[ReplacedStep]:
-    """The steps with a superseded or retried attempt, in the protocol's order."""
+    """Return the steps with a superseded or retried attempt, in the protocol's order."""
     rows = connection.execute(
         text(
             "SELECT e.seq, e.at_utc, i.step, json_extract(e.payload, '$.attempt') AS attempt, "
@@ -167,7 +167,7 @@ def _numbers(measures: str | None, uncertainties: str | None) -> Mapping[str, st
 class ReplacedViewpoint:
     """A viewpoint that was retaken: the replaced event, and the one that counts."""
 
-    seq: int  # of the event that superseded it
+    seq: int  # number of the event that superseded it
     step: str
     viewpoint: str
     reason: str
@@ -176,7 +176,7 @@ class ReplacedViewpoint:
 
 
 def replaced_viewpoints(digest: Digest) -> list[ReplacedViewpoint]:
-    """All retaken viewpoints, in order."""
+    """Return all retaken viewpoints, in order."""
     if digest.state is None:
         return []
     return [
@@ -195,7 +195,7 @@ def replaced_viewpoints(digest: Digest) -> list[ReplacedViewpoint]:
 
 
 def events_of(connection: Connection, run_id: str, *kinds: str, newest: bool = False) -> list[EventRow]:
-    """The events of some kinds with their payloads, LISTED of them at most."""
+    """Return the events of some kinds with their payloads, LISTED of them at most."""
     seqs = seqs_of_kind(connection, run_id, kinds, limit=LISTED, newest=newest)
     return read_rows(connection, run_id, seqs, whole=True)
 
@@ -240,7 +240,7 @@ def correct(store: Store, run_id: str, *, of_seq: int, field: str, new: str, rea
 
 
 def correctable(payload: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The fields that can be corrected, each with its value as text; a few hundred at most."""
+    """Return the fields that can be corrected, each with its value as text; a few hundred at most."""
     found: list[tuple[str, str]] = []
 
     def walk(value: Any, path: tuple[str, ...]) -> None:

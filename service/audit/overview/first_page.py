@@ -45,7 +45,7 @@ NOTE_GROUPS = tuple(group for group in GROUPS if group not in DEVIATION_GROUPS) 
 
 
 def group_name(group: str, number: int) -> str:
-    """The name of a group for this number of findings."""
+    """Return the name of a group for this number of findings."""
     return _OF_ONE[group] if number == 1 else GROUPS[group][0]
 
 
@@ -78,12 +78,12 @@ class Finding:
 
     @property
     def name(self) -> str:
-        """Its kind in words."""
+        """The label of its kind."""
         return _NAMES[self.kind]
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
-    """The deviations of a run, accepted gates first; with `group`, what is in this group, deviations or not."""
+    """Return a run's deviations, accepted gates first; with `group`, what is in this group, deviations or not."""
     kinds = GROUPS[group][1] if group in GROUPS else None
     listed = digest.automatic if group == "automatic" else digest.deviations
     found = [
@@ -98,7 +98,7 @@ def findings(digest: Digest, group: str = "") -> list[Finding]:
 
 
 def failed_gates(digest: Digest) -> list[Finding]:
-    """The gates that did not pass in some attempt, in order: no deviations, but what a reader asks for next."""
+    """Return the gates that did not pass in some attempt, in order: no deviations, but what readers ask for next."""
     return sorted(map(_of_gate, digest.failed_gates), key=lambda finding: finding.seq)
 
 
@@ -115,7 +115,7 @@ def _of_gate(gate: FailedGate) -> Finding:
 
 
 def counts(digest: Digest) -> dict[str, int]:
-    """The number of findings in each group."""
+    """Return the number of findings in each group."""
     by_kind: dict[str, int] = {}
     for deviation in (*digest.deviations, *digest.automatic):
         by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
@@ -143,7 +143,7 @@ class RunFilter:
     q: str = ""
 
     def query(self) -> dict[str, str]:
-        """The filter as query parameters of a link."""
+        """Return the filter as query parameters of a link."""
         names = ("since", "until", "protocol", "person", "status", "simulated", "q")
         fields = {name: getattr(self, name) for name in names}
         fields |= {"deviations": "1" if self.deviations else "", "unverified": "1" if self.unverified else ""}
@@ -177,7 +177,7 @@ class ListedRun:
 
 
 def verified(verification: Verification | None, head_sha256: str) -> str:
-    """The state of a verification: "never", "faults", "outdated" (there are newer events) or "current"."""
+    """Return the state of a verification: "never", "faults", "outdated" (there are newer events) or "current"."""
     if verification is None:
         return "never"
     if not verification.ok:
@@ -186,7 +186,10 @@ def verified(verification: Verification | None, head_sha256: str) -> str:
 
 
 def matches(run: ListedRun, wanted: RunFilter) -> bool:
-    """Whether a run matches, words aside (`find_runs`). A run whose digest is not known yet is not hidden."""
+    """Return whether a run matches the filter, leaving aside its search words (see `find_runs`).
+
+    A run whose digest is not known yet is not hidden.
+    """
     basics, digest = run.basics, run.digest
     day = basics.created_utc[:10]
     fits = (
@@ -206,12 +209,12 @@ def matches(run: ListedRun, wanted: RunFilter) -> bool:
 
 
 def known(value: Digest | PartialProgress) -> Digest | None:
-    """The digest, or None while it is being computed."""
+    """Return the digest, or None while it is being computed."""
     return None if isinstance(value, PartialProgress) else value
 
 
 def people_of(runs: Sequence[ListedRun]) -> list[str]:
-    """Everybody who took part in any of these runs."""
+    """Return everybody who took part in any of these runs."""
     return sorted(
         {name for run in runs for name in (run.basics.operator, *(run.digest.people if run.digest else ()))}
     )

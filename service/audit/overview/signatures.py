@@ -24,14 +24,17 @@ class RecordedSignature:
     step: str
     signed_sha256: str
     bound: EventRow | None  # the event with this hash; None: the run has none
-    unaltered: bool  # whether the bound event's content still has this hash
-    stands: bool | None  # whether it binds the present record of the step; None: not known yet
+    unaltered: bool  # true if the bound event's content still has this hash
+    stands: bool | None  # true if it binds the present record of the step; None: not known yet
     refused: bool  # the action had no effect
     known_by: str  # password, pin, badge or claimed; "" if not recorded
 
 
 def signatures(connection: Connection, run_id: str, digest: Digest | None) -> list[RecordedSignature]:
-    """All signatures of a run in order, its release included. With `digest`, also whether each is still valid."""
+    """Return all signatures of a run in order, its release included.
+
+    With `digest`, also whether each is still valid.
+    """
     # The word index narrows the actions down before any payload is read.
     seqs = connection.execute(
         text(

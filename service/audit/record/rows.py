@@ -23,7 +23,7 @@ LARGEST_SEQ = 2**53
 
 @dataclass(frozen=True, slots=True)
 class RunBasics:
-    """What never changes in a run, and the present end of its chain."""
+    """The facts of a run that never change, and the present end of its chain."""
 
     run_id: str
     created_utc: str
@@ -37,7 +37,7 @@ class RunBasics:
 
 
 def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
-    """All runs, newest first; or the run of this name, if there is one."""
+    """Return all runs, newest first; or the run of this name, if there is one."""
     rows = connection.execute(
         text(
             "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, "
@@ -68,7 +68,7 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
 
 
 def head(connection: Connection, run_id: str) -> tuple[int, str]:
-    """Number and hash of the last event of a run or of the site. Raises UnknownRunError."""
+    """Return the number and hash of the last event of a run or of the site. Raises UnknownRunError."""
     row = connection.execute(
         text("SELECT seq, sha256 FROM heads WHERE run_id = :run"), {"run": plain(run_id)}
     ).one_or_none()
@@ -78,7 +78,7 @@ def head(connection: Connection, run_id: str) -> tuple[int, str]:
 
 
 def plain(value: str) -> str:
-    """The text without lone surrogates, which a request may hold and SQLite refuses."""
+    """Return the text without lone surrogates, which a request may hold and SQLite refuses."""
     return value.encode("utf-8", "replace").decode()
 
 
@@ -88,7 +88,7 @@ _INLINE_CHARACTERS = 6_000  # of a payload in a list; a longer one is shown on t
 
 
 def root(connection: Connection, run_id: str) -> RunStarted:
-    """The first event of a run. Raises UnknownRunError, IntegrityError."""
+    """Return the first event of a run. Raises UnknownRunError, IntegrityError."""
     event = one_event(connection, run_id, 1)
     try:
         return RunStarted.model_validate(event.payload)
@@ -114,10 +114,10 @@ class EventRow:
     previous_sha256: str
     sha256: str
     artefacts: int
-    job: str = ""  # that it is about
+    job: str = ""  # the job that it is about
 
     def record(self, kind: type[P]) -> P | None:
-        """The payload as a record of this kind; None if it is another kind, was altered, or is not complete here."""
+        """Return the payload as a record of this kind; None if it is of another kind, altered or incomplete."""
         try:
             return kind.model_validate(self.payload)
         except ValidationError:
@@ -135,14 +135,14 @@ _ROW = (
 
 
 def read_rows(connection: Connection, run_id: str, seqs: Sequence[int], *, whole: bool = False) -> list[EventRow]:
-    """These events; unless `whole`, long payloads lack their lists and tables."""
+    """Return these events; unless `whole`, long payloads lack their lists and tables."""
     inline = LARGEST_SEQ if whole else _INLINE_CHARACTERS
     values = {"run": plain(run_id), "seqs": json.dumps(list(seqs)), "inline": inline}
     return [_event_row(row, whole=row.size <= inline) for row in connection.execute(text(_ROW), values)]
 
 
 def one_event(connection: Connection, run_id: str, seq: int) -> EventRow:
-    """An event with its whole payload. Raises UnknownRunError."""
+    """Return an event with its whole payload. Raises UnknownRunError."""
     last, _ = head(connection, run_id)
     found = read_rows(connection, run_id, [min(max(seq, 0), LARGEST_SEQ)], whole=True)
     if not found:
@@ -185,7 +185,7 @@ _TELLING = (
 
 
 def headline(payload: Mapping[str, Any]) -> str:
-    """An event in one line: the most telling fields first, without field names if the value is clear without them."""
+    """Return an event in one line: the most telling fields first, without field names where the value is clear."""
     told = [str(payload[name]) for name in _TELLING if isinstance(payload.get(name), str) and payload[name]]
     if "passed" in payload:
         told.append("passed" if payload["passed"] else _not_passed(payload.get("verdicts")))
@@ -214,7 +214,7 @@ def computed_sha256(run_id: str, row: EventRow) -> str:
 
 
 def seq_of_hash(connection: Connection, run_id: str, sha256: str) -> int | None:
-    """The event of the run that has this hash, by the link in its successor or as the last one; or None."""
+    """Return the event of the run that has this hash, by the link in its successor or as the last one; or None."""
     last, end = head(connection, run_id)
     if sha256 == end:
         return last
@@ -228,7 +228,7 @@ def seq_of_hash(connection: Connection, run_id: str, sha256: str) -> int | None:
 def seqs_of_kind(
     connection: Connection, run_id: str, kinds: Sequence[str], *, limit: int = 1000, newest: bool = False
 ) -> list[int]:
-    """Numbers of the first events of some kinds, or with `newest` of the last ones, in order."""
+    """Return numbers of the first events of some kinds, or with `newest` of the last ones, in order."""
     order = "DESC" if newest else "ASC"
     found = connection.execute(
         text(
@@ -241,6 +241,6 @@ def seqs_of_kind(
 
 
 def count_of_kind(connection: Connection, run_id: str, kind: str) -> int:
-    """The number of events of a kind."""
+    """Return the number of events of a kind."""
     statement = text("SELECT count(*) FROM event_index WHERE run_id = :run AND kind = :kind")
     return int(connection.execute(statement, {"run": plain(run_id), "kind": kind}).scalar_one())

@@ -32,7 +32,7 @@ class RecordedFiles:
         self._files = ArtefactFiles(data_dir / "artefacts", DurableFiles(), RandomIds())
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
+        """Return the file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
         return self._files.verified_path(sha256) if verify else self._files.path(sha256)
 
 
@@ -48,16 +48,16 @@ class RecordedRun:
     state: RunState
     artefacts: Sequence[Artefact]
     files: RecordedFiles
-    full_names: Mapping[str, str]  # of accounts, as they are now
+    full_names: Mapping[str, str]  # full names by account, as they are now
 
     def summary(self) -> RunSummary:
-        """The run as the functions of the report and of the data set take it."""
+        """Return the run as the functions of the report and of the data set take it."""
         from service.dataset.summary import RunSummary  # noqa: PLC0415 - loads the numerics, which a bundle does without
 
         return RunSummary(self.run_id, self.protocol, self.root, self.state, self.events, self.files)
 
     def named(self, account: str) -> str:
-        """A person by full name and account; a person without an account by the recorded name."""
+        """Return a person by full name and account; a person without an account by the recorded name."""
         return named(account, self.full_names)
 
 
@@ -92,7 +92,7 @@ def read_run(data_dir: Path, name: str, *, last_seq: int | None = None) -> Recor
 
 
 def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:
-    """Lines such as `COLMAP from scratch: was still being computed`; empty if every result has arrived.
+    """Return lines such as `COLMAP from scratch: was still being computed`; empty if every result has arrived.
 
     The same events give the same lines, so the time that is left is not among them.
     """

@@ -20,11 +20,11 @@ class Filter:
 
     @property
     def active(self) -> bool:
-        """Whether anything is filtered."""
+        """True if any filter is set."""
         return bool(self.query())
 
     def query(self) -> dict[str, str]:
-        """The filter as query parameters of a link."""
+        """Return the filter as query parameters of a link."""
         return {name: value for name, value in asdict(self).items() if value}
 
 
@@ -57,7 +57,7 @@ class EventPage:
 
 
 def search_expression(q: str) -> str | None:
-    """A person's words as an FTS5 expression that matches every word as a prefix; None if there is no word."""
+    """Return a person's words as an FTS5 expression that matches every word as a prefix; None if there is no word."""
     words = plain(q)[:_SEARCH_CHARACTERS].replace("\0", " ").replace('"', " ").split()
     terms = [word for word in words if _WORD.search(word)][:_SEARCH_TERMS]
     return " AND ".join(f'"{term}"*' for term in terms) or None
@@ -73,7 +73,7 @@ def events_page(
     size: int = PAGE,
     counted: int | None = None,
 ) -> EventPage:
-    """The first events after `after`, or with `before` the last ones before it. Raises UnknownRunError.
+    """Return the first events after `after`, or with `before` the last ones before it. Raises UnknownRunError.
 
     Args:
         counted: the number of matches, if known; otherwise they are counted.
@@ -103,7 +103,10 @@ def events_page(
 
 
 def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[str, dict[str, Any]]:
-    """Conditions on event_index AS i. Reading a range of positions in order is cheaper than using another index."""
+    """Return conditions on event_index AS i.
+
+    Reading a range of positions in order is cheaper than using another index.
+    """
     ends = connection.execute(
         text(
             "SELECT (SELECT position FROM event_index WHERE run_id = :run ORDER BY seq LIMIT 1), "
@@ -180,7 +183,7 @@ class Facets:
     devices: dict[str, int] = field(default_factory=dict[str, int])
 
     def matching(self, wanted: EventFilter) -> int | None:
-        """The number of events that match a filter with one condition; None for filters with none or several."""
+        """Return the number of events that match a filter with one condition; None with none or several."""
         counts = {"kind": self.kinds, "step": self.steps, "person": self.people}
         fields = wanted.query()
         if len(fields) != 1 or not counts.keys() & fields.keys():
@@ -189,7 +192,7 @@ class Facets:
         return counts[name].get(value, 0)
 
     def copy(self) -> Facets:
-        """A copy that can be continued while pages read this one."""
+        """Return a copy that can be continued while pages read this one."""
         return Facets(dict(self.kinds), dict(self.steps), dict(self.people), dict(self.devices))
 
     def add(self, connection: Connection, run_id: str, after: int, upto: int) -> None:
@@ -248,7 +251,7 @@ class ArtefactRow:
 
     @property
     def is_picture(self) -> bool:
-        """Whether a browser can show it."""
+        """True if a browser can show the file."""
         return self.media_type in ("image/jpeg", "image/png")
 
 
@@ -272,7 +275,10 @@ _COLUMNS = (
 def artefacts_page(
     connection: Connection, run_id: str, wanted: ArtefactFilter, *, page: int = 1, size: int = PAGE
 ) -> ArtefactPage:
-    """One page, in the order of the events; a page number out of range gives the nearest. Raises UnknownRunError."""
+    """Return one page, in the order of the events; a page number out of range gives the nearest.
+
+    Raises UnknownRunError.
+    """
     head(connection, run_id)
     where, values = _artefact_condition(run_id, wanted)
     totals = connection.execute(
@@ -306,7 +312,7 @@ def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[
 
 
 def to_row(row: Any) -> ArtefactRow:
-    """A row of the table `artefacts` as an ArtefactRow."""
+    """Return a row of the table `artefacts` as an ArtefactRow."""
     return ArtefactRow(
         seq=row.seq,
         position=row.position,
@@ -327,7 +333,7 @@ def to_row(row: Any) -> ArtefactRow:
 
 
 def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]) -> list[ArtefactRow]:
-    """The artefacts that these events brought."""
+    """Return the artefacts that these events brought."""
     if not seqs:
         return []
     rows = connection.execute(
@@ -341,7 +347,7 @@ def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]
 
 
 def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[ArtefactRow]:
-    """Every record of a file in this run; the first says where it came from. Raises UnknownRunError."""
+    """Return every record of a file in this run; the first says where it came from. Raises UnknownRunError."""
     head(connection, run_id)
     rows = connection.execute(
         text(
@@ -361,7 +367,7 @@ def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[Artef
 
 
 def artefact_facets(connection: Connection, run_id: str) -> dict[str, dict[str, int]]:
-    """The values to filter by, each with its number of artefacts."""
+    """Return the values to filter by, each with its number of artefacts."""
     rows = connection.execute(
         text("SELECT kind, step, device, count(*) AS n FROM artefacts WHERE run_id = :run GROUP BY 1, 2, 3"),
         {"run": plain(run_id)},

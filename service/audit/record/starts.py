@@ -73,7 +73,7 @@ def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tup
 
 
 def _last_start(connection: Connection) -> tuple[Event | None, int]:
-    """The last ServiceStarted and its position among all events; (None, 0) if there is none."""
+    """Return the last ServiceStarted and its position among all events; (None, 0) if there is none."""
     found = (
         select(event_index.c.seq, event_index.c.position)
         .where(event_index.c.run_id == SITE, event_index.c.kind == "service_started")
@@ -92,7 +92,7 @@ def _same_boot(before: ServiceStarted | None, boot: str) -> bool:
 
 
 def _clock_jump_s(clock: Clock, last: Event) -> float:
-    """Seconds by which UTC advanced more than the monotonic clock since the last start: how far it was set."""
+    """Return seconds by which UTC advanced more than the monotonic clock since the last start: how far it was set."""
     utc_s = clock.utc_s() - datetime.fromisoformat(last.at_utc).timestamp()
     return round(utc_s - (clock.monotonic_s() - last.monotonic_s), 6)
 

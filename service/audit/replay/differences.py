@@ -44,21 +44,21 @@ class Difference:
     path: str
     recorded: Any
     recomputed: Any
-    difference: float | None  # in `unit`; None unless both are numbers
+    difference: float | None  # the difference in `unit`; None unless both are numbers
     relative: float | None  # relative to the largest number of the field
     unit: str
     values: int = 1  # number of values that differ
-    added: bool = False  # what was recorded has no such field
+    added: bool = False  # true if what was recorded has no such field
 
     @property
     def wording(self) -> bool:
-        """Whether only the wording of an explanation differs: the numbers that it explains are compared."""
+        """True if only the wording of an explanation differs: the numbers that it explains are compared."""
         texts = isinstance(self.recorded, str) and isinstance(self.recomputed, str)
         return texts and self.path.rpartition(".")[2] in _EXPLANATIONS
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether at most rounding or the wording of an explanation differs."""
+        """True if at most rounding or the wording of an explanation differs."""
         return self.wording or (self.relative is not None and self.relative <= TOLERANCE)
 
 
@@ -71,16 +71,16 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether both are bit-identical."""
+        """True if recorded and recomputed data are bit-identical."""
         return not self.differences
 
     @property
     def equal(self) -> bool:
-        """Whether nothing but rounding differs."""
+        """True if nothing but rounding or wording differs."""
         return all(d.within_tolerance for d in self.differences)
 
     def of_recorded(self) -> Comparison:
-        """The comparison of the fields that were recorded, without those that only the recomputed data have."""
+        """Return the comparison of the recorded fields, without those that only the recomputed data have."""
         return replace(self, differences=tuple(d for d in self.differences if not d.added))
 
 
@@ -118,8 +118,8 @@ def compare_data(
     """Compare plain data (what JSON can hold) number by number.
 
     Args:
-        recorded: from the evidence.
-        recomputed: by the replay.
+        recorded: the data in the evidence.
+        recomputed: the data that the replay computed.
         path: prefix of every path.
         renamed: hashes of recomputed files: recorded → recomputed.
     """
@@ -209,7 +209,7 @@ def _scalar(a: float, b: float, path: str) -> Difference:
 
 
 def unit_of(path: str) -> tuple[str, float]:
-    """The unit to show and the factor to it, by the last name in a path that has one."""
+    """Return the unit to show and the factor to it, by the last name in a path that has one."""
     for name in reversed(re.split(r"[.\[\] ]+", path)):
         for ending in sorted(_UNITS, key=len, reverse=True):
             if name.endswith(ending):
@@ -222,7 +222,7 @@ def _is_pose(path: str) -> bool:
 
 
 def _is_table(mapping: Mapping[str, Any]) -> bool:
-    """Whether a mapping has many entries of one form, such as viewpoints, and so counts as one field."""
+    """Return whether a mapping has many entries of one type, such as viewpoints, and so counts as one field."""
     kinds = {type(value) for value in mapping.values()}
     return len(mapping) > 5 and len(kinds) == 1 and kinds <= {list, tuple, dict}
 
@@ -232,7 +232,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _numbers(values: Sequence[Any]) -> Array | None:
-    """Nested lists of numbers as an array, or None."""
+    """Return nested lists of numbers as an array, or None."""
     if not _only_numbers(values):
         return None
     try:

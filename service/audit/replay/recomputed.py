@@ -1,4 +1,4 @@
-"""Keeps the answers that a replay has computed as input of later jobs, in its own folder, and tells their drift."""
+"""Stores the answers that a replay has computed as input of later jobs in its own folder; reports their drift."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class CopiedResults:
                 self._index(job, f"{path}/{index}", item)
 
     def as_references(self, arguments: Any) -> Any:
-        """The arguments with a reference in place of every copy."""
+        """Return the arguments with a reference in place of every copy."""
         if _is_telling(arguments):
             found = self._parts.get(_key(arguments))
             if found is not None:
@@ -68,7 +68,7 @@ def _key(value: Any) -> str:
 
 
 def _is_telling(value: Any) -> bool:
-    """Whether this holds a number with so many digits that equality means a copy."""
+    """Return whether a value holds a number with so many digits that equality means a copy."""
     if isinstance(value, float):
         digits = repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")
         return len(digits) >= _TELLING_DIGITS and value.as_integer_ratio()[0].bit_length() >= _TELLING_BITS
@@ -82,8 +82,8 @@ class Drift:
     """Displacement of the scan from its recorded registration, at the centre of its spheres."""
 
     registration: str
-    in_world_mm: float | None  # by T_world_scan; None if the world frame is that of the reconstruction
-    against_cameras_mm: float  # after aligning the cameras
+    in_world_mm: float | None  # drift by T_world_scan; None if the world frame is that of the reconstruction
+    against_cameras_mm: float  # drift after aligning the cameras
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class RecomputedJobs:
         self.pairs.append(_Pair(step, job, again))
 
     def arguments(self, job: JobState) -> Mapping[str, Any]:
-        """A job's arguments with the recomputed answers of earlier jobs."""
+        """Return a job's arguments with the recomputed answers of earlier jobs."""
         return self._with_new_hashes(resolve(self._copied.as_references(job.arguments), self._jobs))
 
     def _with_new_hashes(self, value: Any) -> Any:
@@ -126,7 +126,7 @@ class RecomputedJobs:
         return self.renamed.get(value, value) if isinstance(value, str) else value
 
     def measures_of(self, step: StepState) -> dict[str, float] | None:
-        """A step's measures with the recomputed measures of its jobs; None if no job of it was computed again."""
+        """Return a step's measures with the recomputed ones of its jobs; None if no job of it was computed again."""
         pairs = {pair.before.job: pair for pair in self.pairs if pair.step == step.step}
         if not pairs:
             return None
@@ -139,7 +139,7 @@ class RecomputedJobs:
 
 
 def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
-    """The drift of every registration that was computed again."""
+    """Yield the drift of every registration that was computed again."""
     spheres = summary.scan_spheres_m()
     if not spheres:
         return
@@ -166,7 +166,7 @@ class ScratchStore:
         self._folder = folder
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """A recomputed file, or else the recorded one. Raises IntegrityError."""
+        """Return a recomputed file, or else the recorded one. Raises IntegrityError."""
         own = self._folder / sha256
         return own if own.is_file() else self._recorded.artefact_path(sha256, verify=verify)
 

@@ -69,7 +69,7 @@ class JobReplay:
 
     @property
     def differences(self) -> tuple[Difference, ...]:
-        """Of measures, result and files, in this order, each worst first."""
+        """The differences of measures, result and files, in this order, each worst first."""
         parts = (self.measures, self.result, *(artefact.content for artefact in self.artefacts))
         return tuple(difference for part in parts for difference in part.differences)
 
@@ -139,12 +139,12 @@ def replay(
     gets the recomputed ones. Nothing is written into the data folder.
 
     Args:
-        run: as `read_run` gives it.
-        kinds: of jobs.
+        run: the run, as `read_run` returns it.
+        kinds: the kinds of jobs to compute.
         step: only this step's jobs.
         end_to_end: feed each job the recomputed results; the report then has the drift of each registration.
         out: folder to keep the recomputed files in, by step, job and name.
-        progress: called with the activity, the amount done and the total.
+        progress: a function that is called with the activity, the amount done and the total.
 
     Raises:
         IntegrityError: the evidence does not verify; the message names the first fault.
@@ -261,7 +261,7 @@ def _compare(
     files: tuple[RecordedFiles, ScratchStore],
     renamed: Mapping[str, str],
 ) -> JobReplay:
-    """The job with its measures, result and files compared. `now`: as its event would be."""
+    """Return the job with its measures, result and files compared. `now`: as its event would be."""
     artefacts = [
         _compare_artefacts(*files, old, new, renamed)
         for old, new in zip(recorded.artefacts, answer.artefacts, strict=False)
@@ -287,19 +287,19 @@ def _verdict(parts: Iterable[Comparison], *, same_files: bool) -> Verdict:
 
 
 def _finished(run: RecordedRun, job: JobState) -> JobFinished:
-    """The event whose result counts: the first one, when a second worker finished it too."""
+    """Return the event whose result counts: the first one, when a second worker finished it too."""
     events = (event.payload for event in run.events)
     return next(p for p in events if isinstance(p, JobFinished) and p.job == job.job)
 
 
 def _version(run: RecordedRun, job: JobState) -> int:
-    """The version of the computation that was enqueued."""
+    """Return the version of the computation that was enqueued."""
     events = (event.payload for event in run.events)
     return next(p.version for p in events if isinstance(p, JobEnqueued) and p.job == job.job)
 
 
 def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> JobFinished:
-    """An answer as it would stand in the evidence, through the same canonical form."""
+    """Return an answer as it would stand in the evidence, through the same canonical form."""
     payload = recorded.model_copy(
         update={
             "measures": dict(answer.measures),
@@ -321,7 +321,7 @@ def _compare_artefacts(
 
 
 def _gates(run: RecordedRun, recomputed: RecomputedJobs) -> Iterator[GateReplay]:
-    """The gates of every step whose measures hold a recomputed one.
+    """Yield the gates of every step whose measures hold a recomputed one.
 
     That the recorded verdicts follow from the recorded measures is what reading the run has shown: `fold` refuses
     others.
@@ -344,7 +344,7 @@ def _keep(store: ScratchStore, job: JobReplay, folder: Path) -> None:
 
 
 def changed_versions(run: RecordedRun) -> tuple[VersionChange, ...]:
-    """Distributions that differ between the run's last session and this process."""
+    """Return distributions that differ between the run's last session and this process."""
     sessions = [e.payload for e in run.events if isinstance(e.payload, SessionStarted)]
     recorded = sessions[-1].software if sessions else run.root.software
     now = software_versions()

@@ -51,7 +51,7 @@ _SOURCES = {
 
 
 def result_sentence(summary: RunSummary) -> TableCell:
-    """The result with its uncertainty and its limit."""
+    """Return the result with its uncertainty and its limit."""
     best, row = summary.best(), _best_row(summary)
     if best is None or row is None:
         return TableCell("Not evaluated: nothing can be said about the accuracy of this data set.", "attention")
@@ -74,7 +74,7 @@ def result_sentence(summary: RunSummary) -> TableCell:
 
 
 def rests_on(summary: RunSummary) -> tuple[str, ...]:
-    """The accepted gates on which the evaluation rests, in words."""
+    """Return texts on the accepted gates on which the evaluation rests."""
     evaluations = [step.id for step in summary.protocol.steps if step.gives == "accuracy"]
     gates = (gate for step in evaluations for gate in depends_on(summary.protocol, summary.state, step))
     return tuple(dict.fromkeys(f"Depends on an accepted gate: {gate.text}" for gate in gates))
@@ -91,7 +91,7 @@ def _best_row(summary: RunSummary) -> Row | None:
 
 
 def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | None) -> Section:
-    """A table with one row for each source of camera poses, with the paper's figures."""
+    """Return a table with one row for each source of camera poses, with the paper's figures."""
     rows = summary.table()
     title = "Registration error by source of camera poses"
     if not rows:
@@ -120,7 +120,7 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
 
 
 def _table(rows: Sequence[Row], own: str | None, true_error_mm: Mapping[str, float] | None) -> Table:
-    """One row for each source of poses; that of the run's `own` registration is marked."""
+    """Return one row for each source of poses; that of the run's `own` registration is marked."""
     columns = [
         Column("camera poses", 2.6),
         Column("images", 1.1),
@@ -141,7 +141,7 @@ def _table(rows: Sequence[Row], own: str | None, true_error_mm: Mapping[str, flo
 
 
 def _control_spheres(row: Row) -> Table:
-    """Each control sphere by itself, with the run's own registration."""
+    """Return each control sphere by itself, with the run's own registration."""
     columns = (
         Column("control sphere", 1.0),
         Column("radial error (mm)", 1.0, "number"),
@@ -177,7 +177,7 @@ def _texts(row: Row, *, best: bool) -> tuple[str, ...]:
 
 
 def later_section(summary: RunSummary) -> Section | None:
-    """Results that arrived after the evaluation, what they changed, and what is still missing; None without any."""
+    """Return results that arrived after the evaluation, their effect, and what is still missing; None without any."""
     late = late_results(summary.protocol, summary.state)
     missing = not_in_yet(summary.protocol, summary.state, summary.events)
     if not late and not missing:
@@ -205,7 +205,7 @@ def later_section(summary: RunSummary) -> Section | None:
 
 
 def _paper(row: Row) -> str:
-    """The paper's figures for this source, at the image width nearest to the row's."""
+    """Return the paper's figures for this source, at the image width nearest to the row's."""
     width = int(row.resolution.split()[0])
     known = [at for source, at in _PAPER if source == row.source]
     if not known:
@@ -216,7 +216,7 @@ def _paper(row: Row) -> str:
 
 
 def budget_section(summary: RunSummary) -> Section | None:
-    """The error budget by source, compared with independent measurements; None without an evaluation."""
+    """Return the error budget by source, compared with independent measurements; None without an evaluation."""
     best = summary.best()
     budget = summary.budgets().get(best or "")
     if budget is None or budget.total_mm is None:
@@ -278,7 +278,7 @@ _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 def further_cameras_section(run: RecordedRun) -> Section | None:
-    """A table of all, then the numbers of each; None for a run with one camera."""
+    """Return a table of all, then the numbers of each; None for a run with one camera."""
     cameras = known_further_cameras(run.protocol, run.state, run.summary().captures())
     if not cameras:
         return None

@@ -143,7 +143,7 @@ Shape = Rectangle | Line | Label | Raster
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A chart in its own units, scaled to the available width; `text` describes it in words.
+    """A chart in its own units, scaled to the available width; `text` describes it.
 
     `name`: of its file, without suffix; `rows`: the figures that it shows, below a row of their names with units.
     """
@@ -205,24 +205,24 @@ class Report:
 
 
 def utc(text: str) -> str:
-    """A time in ISO 8601 as `2026-11-21 10:12:03 UTC`."""
+    """Return a time in ISO 8601 as `2026-11-21 10:12:03 UTC`."""
     moment = datetime.fromisoformat(text)
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def moment(at: datetime) -> str:
-    """A datetime as `2026-11-21 10:12:03 UTC`."""
+    """Return a datetime as `2026-11-21 10:12:03 UTC`."""
     return utc(at.isoformat())
 
 
 def clock(text: str) -> str:
-    """A time in ISO 8601 as `10:12:03`, in UTC."""
+    """Return a time in ISO 8601 as `10:12:03`, in UTC."""
     return utc(text).split()[1]
 
 
 def duration(start: str, end: str) -> str:
-    """The time between two times in ISO 8601, as `3 min 5 s`."""
+    """Return the time between two times in ISO 8601, as `3 min 5 s`."""
     seconds = round((datetime.fromisoformat(end) - datetime.fromisoformat(start)).total_seconds())
     hours, rest = divmod(max(seconds, 0), 3600)
     minutes, seconds = divmod(rest, 60)
@@ -232,12 +232,12 @@ def duration(start: str, end: str) -> str:
 
 
 def words(name: str) -> str:
-    """A name in the records as words: viewpoint_skipped → viewpoint skipped."""
+    """Return a name in the records as words: viewpoint_skipped → viewpoint skipped."""
     return term(name)
 
 
 def limit(verdict: GateVerdict) -> str:
-    """The limits of a gate, as `≥ 0.2 and ≤ 1`."""
+    """Return the limits of a gate, as `≥ 0.2 and ≤ 1`."""
     return limits(verdict.minimum, verdict.maximum)
 
 
@@ -255,10 +255,10 @@ _JUDGED: dict[Standing, TableCell] = {
 
 
 def judged(verdict: GateVerdict, *, accepted: bool = False) -> TableCell:
-    """The verdict of a gate as a sign and a word with a tone. `accepted`: a person accepted the step's figures."""
+    """Return a gate's verdict as a sign and a word with a tone. `accepted`: a person accepted the step's figures."""
     return _JUDGED[standing(verdict, accepted=accepted)]
 
 
 def mm(value: float | None, digits: int = 3) -> str:
-    """Millimetres without the unit; `–` for None."""
+    """Return millimetres without the unit; `–` for None."""
     return "–" if value is None else f"{value:.{digits}f}"

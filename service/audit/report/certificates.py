@@ -51,7 +51,7 @@ _PALE, _DEEP = (239, 244, 250), (31, 95, 191)
 
 
 def coverage_drawing(coverage: Coverage, size: tuple[int, int]) -> Drawing:
-    """Number of board corners in each cell of an image of `size` (width, height), px."""
+    """Return the number of board corners in each cell of an image of `size` (width, height), px."""
     counts = np.array(coverage.corners, dtype=np.float64)
     empty = int(np.sum(counts == 0))
     shapes, height = _cells(counts, size, lambda value: f"{value:.0f}")
@@ -68,7 +68,7 @@ def coverage_drawing(coverage: Coverage, size: tuple[int, int]) -> Drawing:
 
 
 def uncertainty_drawing(known: ProjectionUncertainty, size: tuple[int, int]) -> Drawing:
-    """Standard deviation of a projected point over the image, in micrometres at the board's distance."""
+    """Return the standard deviation of a projected point over the image, in micrometres at the board's distance."""
     field = np.array(known.sigma_mm, dtype=np.float64)
     coarse = mm(field[:: max(1, len(field) // 8), :: max(1, len(field[0]) // 12)])
     shapes, height = _cells(np.log(coarse), size, lambda value: f"{math.exp(value):.2g}")
@@ -85,7 +85,7 @@ def uncertainty_drawing(known: ProjectionUncertainty, size: tuple[int, int]) -> 
 
 
 def residual_drawing(residuals: ResidualField, rms_px: float | None, size: tuple[int, int]) -> Drawing:
-    """Mean residual of each cell as an arrow: the error of the lens model. `rms_px`: of all corners."""
+    """Return the mean residual of each cell as an arrow: the error of the lens model. `rms_px`: of all corners."""
     mean = np.array(residuals.mean_px, dtype=np.float64)
     counts = np.array(residuals.corners)
     known = counts > 0
@@ -120,7 +120,7 @@ def residual_drawing(residuals: ResidualField, rms_px: float | None, size: tuple
 
 
 def bars_drawing(name: str, title: str, text: str, values: Mapping[str, float], unit: str) -> Drawing:
-    """A bar for each view, on a scale up to the largest value; `name`: of the file."""
+    """Return a bar for each view, on a scale up to the largest value; `name`: of the file."""
     height, base = 190.0, 160.0
     largest = max(values.values(), default=0.0) or 1.0
     step = (_WIDTH - 50) / max(len(values), 1)
@@ -142,7 +142,7 @@ def bars_drawing(name: str, title: str, text: str, values: Mapping[str, float], 
 
 
 def _by_cell(values: Array, size: tuple[int, int], name: str, form: str) -> tuple[tuple[str, ...], ...]:
-    """One row for each cell: its indices, its position in the image, and its value."""
+    """Return one row for each cell: its indices, its position in the image, and its value."""
     cells = (
         (*_cell(int(at[0]), int(at[1]), values.shape, size), form.format(value))
         for at, value in np.ndenumerate(values)
@@ -151,7 +151,7 @@ def _by_cell(values: Array, size: tuple[int, int], name: str, form: str) -> tupl
 
 
 def _cell(row: int, column: int, shape: tuple[int, ...], size: tuple[int, int]) -> tuple[str, ...]:
-    """Row, column, and the middle of the cell in px; pixel centres at integer coordinates."""
+    """Return the row, column, and the middle of the cell in px; pixel centres at integer coordinates."""
     x, y = (column + 0.5) * size[0] / shape[1] - 0.5, (row + 0.5) * size[1] / shape[0] - 0.5
     return str(row), str(column), f"{x:.1f}", f"{y:.1f}"
 
@@ -191,7 +191,7 @@ _INVARIANTS = ("settings_departures", "optics_departures")
 
 
 def certificate_sections(run: RecordedRun) -> Iterator[Section]:
-    """A certificate for each calibration step that has a result."""
+    """Yield a certificate for each calibration step that has a result."""
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         kept = [ref for ref in state.artefacts if ref.kind == "calibration"]
@@ -288,7 +288,7 @@ def _intrinsics(solved: calibrate.Answer) -> Iterator[Block]:
 
 
 def _parameters(camera: Camera, record: Intrinsics) -> Table:
-    """Value and standard deviation of each recorded parameter, in two columns."""
+    """Return the value and standard deviation of each recorded parameter, in two columns."""
     known = {name: float(getattr(camera, name)) for name in _PARAMETERS if name in camera.model_fields_set}
     texts = [
         (name, f"{value:.7g}", f"{record.sigma[name]:.2g}" if name in record.sigma else "held")
@@ -322,7 +322,7 @@ def _hand_eye(solved: calibrate.Answer) -> Iterator[Block]:
 
 
 def _validity(run: RecordedRun, step_id: str) -> Iterator[Block]:
-    """What the certificate is valid for, and the gates that watch it."""
+    """Yield the section on what the certificate is valid for, and on the gates that watch it."""
     yield Heading("Validity, and what makes a new calibration necessary")
     yield Paragraph(
         "It holds for this camera, lens and mount as long as zoom, focus, aperture and the screws between flange and "

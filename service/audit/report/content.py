@@ -36,7 +36,7 @@ from service.store.verification.verify import AuditReport
 
 
 def facts(run: RecordedRun) -> DescriptionList:
-    """Names and values for the first page."""
+    """Return names and values for the first page."""
     root, state, events = run.root, run.state, run.events
     shots = shots_by_step(run.protocol, state, failed_exposures(events))
     others = sorted(run.named(person) for person in state.people - {root.operator})
@@ -74,7 +74,7 @@ def facts(run: RecordedRun) -> DescriptionList:
 
 
 def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, TableCell | str]]:
-    """Specimen, site and purpose as entered, the rig, and the machine that drove the run."""
+    """Yield the specimen, site and purpose as entered, the rig, and the machine that drove the run."""
     entered = about_facts(run)
     names = {name for name, _ in entered}
     if "Specimen" not in names:
@@ -89,7 +89,7 @@ def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, TableCell | str]
 
 
 def _rig_name(run: RecordedRun) -> str:
-    """The name in the rig file; "" for imported photographs, or if the file is missing or altered."""
+    """Return the name in the rig file; "" for imported photographs, or if the file is missing or altered."""
     if run.root.origin == "imported":
         return ""
     try:
@@ -117,13 +117,13 @@ def report_content(
     with_scene: bool = True,
     with_pictures: bool = True,
 ) -> Report:
-    """The report of a run.
+    """Return the report of a run.
 
     Args:
         run: the run.
         audit: the result of the verification, which is shown on the first page.
         made_at: the time stamp of the report, default: now. The same evidence and time stamp give the same report.
-        true_error_mm: by source of poses, on a simulated rig, where the truth is known; marked as such.
+        true_error_mm: the true error by source of poses, which only a simulated rig knows; it is marked as such.
         with_scene: include the scene that can be turned, which only HTML can show; its drawing is always included.
         with_pictures: False leaves out everything that shows photographs.
     """
@@ -156,7 +156,7 @@ def _sections(
     with_scene: bool,
     with_pictures: bool,
 ) -> list[Section | None]:
-    """In the order of the report; None for a section that this run does not have."""
+    """Return the sections in the order of the report; None stands for a section that this run does not have."""
     omitted = Paragraph("They were left out, because this report belongs to a bundle without files.")
     summary = run.summary()
     return [
@@ -187,14 +187,14 @@ def _verification(audit: AuditReport) -> TableCell:
 
 
 def _origin(run: RecordedRun) -> TableCell | None:
-    """The statement on imported photographs; None if the run took its photographs itself."""
+    """Return the statement on imported photographs; None if the run took its photographs itself."""
     if run.root.origin != "imported":
         return None
     return TableCell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
 
 
 def _release(run: RecordedRun) -> TableCell | None:
-    """The statement on the release; None if the protocol does not ask for one."""
+    """Return the statement on the release; None if the protocol does not ask for one."""
     if run.protocol.release != "second_person":
         return None
     if run.state.released_by:

@@ -41,7 +41,7 @@ from service.core.text.words import counted
 
 @dataclass(frozen=True, slots=True)
 class NotableEvent:
-    """An event that a reader must know of, in words."""
+    """A text on an event that a reader must know of."""
 
     seq: int
     kind: str
@@ -51,7 +51,7 @@ class NotableEvent:
 
 
 def deviations(run: RecordedRun) -> list[NotableEvent]:
-    """The deviations of the run, accepted gates first, then in the order of their events."""
+    """Return the deviations of the run, accepted gates first, then in the order of their events."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found = [
         NotableEvent(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
@@ -61,7 +61,7 @@ def deviations(run: RecordedRun) -> list[NotableEvent]:
 
 
 def incidents(run: RecordedRun) -> list[NotableEvent]:
-    """What else a reader must know of, and is no deviation: failed gates, faults, corrections, what is not done."""
+    """List what a reader must know that is no deviation: failed gates, faults, corrections, what was not done."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found: list[NotableEvent] = []
     for event in run.events:
@@ -105,7 +105,7 @@ def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
 
 
 def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Section:
-    """The deviations; then what else happened, and the number of replaced attempts and views."""
+    """Return the deviations; then what else happened, and the number of replaced attempts and views."""
     blocks: list[Block] = [_table(run, listed) if listed else _none(run)]
     others = incidents(run)
     if others:
@@ -128,7 +128,7 @@ def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Sect
 
 
 def no_deviation(run: RecordedRun) -> TableCell:
-    """The statement on a run without deviations, which says so where the run has not been done to its end."""
+    """Return the statement on a run without deviations, which says so where the run has not been done to its end."""
     if run.state.status == "completed":
         return TableCell("No deviation: every step was done as the protocol says", "ok")
     undone = sum(step.phase != "passed" for step in run.state.steps.values())
@@ -157,7 +157,7 @@ def _table(run: RecordedRun, listed: Sequence[NotableEvent]) -> Table:
 
 
 def steps_section(run: RecordedRun) -> Section:
-    """Every step with its gates: value, limit and verdict."""
+    """Return every step with its gates: value, limit and verdict."""
     columns = (
         Column("gate", 3.4),
         Column("value", 1.4, "number"),
@@ -197,7 +197,7 @@ def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, S
 
 
 def people_section(run: RecordedRun) -> Section:
-    """Signatures with name, time, meaning and the hash that they bind; then who did what, and how often."""
+    """Return signatures with name, time, meaning and the hash that they bind; then who did what, and how often."""
     signatures = _signatures(run)
     unsigned = [
         step.title
@@ -237,7 +237,7 @@ def _signatures(run: RecordedRun) -> Table:
 
 
 def _meaning(signed: OperatorAction) -> str:
-    """The stated meaning of a signature or an acceptance, and how the person was identified."""
+    """Return the recorded meaning of a signature or an acceptance, and how the person was identified."""
     how = "automatic" if signed.automatic else signed.via
     how += {"pin": ", by PIN", "badge": ", by badge"}.get(signed.identified, "")
     said = f"accepted outside its limits, {signed.reason}" if signed.action == "accept" else signed.meaning

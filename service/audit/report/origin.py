@@ -31,7 +31,7 @@ _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolm
 
 
 def devices_section(run: RecordedRun) -> Section:
-    """Every device that answered, its versions and clocks; light and temperature over the captures."""
+    """Return every device that answered, its versions and clocks; light and temperature over the captures."""
     known = bodies(run.events)
     blocks: list[Block] = [_devices(run, known)]
     blocks += [Paragraph(f"{text}.") for text in known.explained]
@@ -75,7 +75,7 @@ def _devices(run: RecordedRun, known: CameraBodies) -> Table:
 
 
 def _stillness(captures: list[ViewpointCaptured]) -> str:
-    """The drift of the robot's clock over the captures, and the motion of the flange during exposures."""
+    """Return the drift of the robot's clock over the captures, and the motion of the flange during exposures."""
     offsets = np.array([capture.clock_offset_s for capture in captures])
     sigma_m = max(capture.pose_sigma_m for capture in captures)
     return (
@@ -86,7 +86,7 @@ def _stillness(captures: list[ViewpointCaptured]) -> str:
 
 
 def _clocks(run: RecordedRun) -> Iterator[Block]:
-    """The last comparison of each clock, and what depends on it."""
+    """Yield the last comparison of each clock, and what depends on it."""
     readings = clock_readings(run.events)
     if not readings:
         return
@@ -130,7 +130,7 @@ def _environment(captures: list[ViewpointCaptured]) -> str:
 
 
 def software_section(run: RecordedRun) -> Section:
-    """The software, the number and duration of the computations, and every installed distribution."""
+    """Return the software, the number and duration of the computations, and every installed distribution."""
     sessions = [event.payload for event in run.events if isinstance(event.payload, SessionStarted)]
     software = sessions[-1].software if sessions else run.root.software
     first = ", ".join(f"{name} {software[name]}" for name in _COMPUTES if name in software)
@@ -180,7 +180,7 @@ _PART_11 = (
 
 
 def verification_section(run: RecordedRun, audit: AuditReport) -> Section:
-    """Verification, chain head, keys, and how to do it again."""
+    """Return verification, chain head, keys, and how to do it again."""
     blocks: list[Block] = [_checked(run, audit)]
     if audit.faults:
         blocks += _faults(audit)
@@ -190,7 +190,7 @@ def verification_section(run: RecordedRun, audit: AuditReport) -> Section:
 
 
 def _checked(run: RecordedRun, audit: AuditReport) -> DescriptionList:
-    """How much was checked, the chain head, and the keys."""
+    """Return how much was checked, the chain head, and the keys."""
     head = run.events[-1]
     unsigned = audit.unsigned_events.get(run.run_id, 0)
     rows: list[tuple[str, TableCell | str]] = [

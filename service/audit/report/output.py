@@ -45,7 +45,7 @@ _FONTS = "'DejaVu Sans', system-ui, sans-serif"
 
 
 def drawing_svg(drawing: Drawing) -> str:
-    """An svg element with title and description for screen readers."""
+    """Return an svg element with title and description for screen readers."""
     parts: list[str] = []
     for shape in drawing.shapes:
         if isinstance(shape, Rectangle):
@@ -76,13 +76,13 @@ def write_html(report: Report, path: Path) -> None:
 
 
 def render_html(report: Report) -> str:
-    """The report as HTML."""
+    """Return the report as HTML."""
     return _template().render(report=report)
 
 
 @cache
 def _template() -> Template:
-    """The template, which takes longer to compile than to fill in."""
+    """Return the template, which takes longer to compile than to fill in."""
     environment = Environment(
         loader=PackageLoader("service.audit.report"),
         autoescape=select_autoescape(["html", "j2"]),
@@ -138,7 +138,7 @@ def write_pdf(report: Report, path: Path) -> None:
 
 
 def render_pdf(report: Report) -> bytes:
-    """The report as PDF; the same report and the same fonts give the same bytes.
+    """Return the report as PDF; the same report and the same fonts give the same bytes.
 
     It conforms to PDF/UA-1, unless a text has characters that no font of this machine has. They are then shown as
     boxes, which the standard does not allow, and the document is tagged but does not claim the standard.
@@ -163,7 +163,7 @@ def render_pdf(report: Report) -> bytes:
 
 
 def _document(report: Report, folder: Path) -> dict[str, Any]:
-    """The report as plain data; pictures and drawings are written beside it as files."""
+    """Return the report as plain data; pictures and drawings are written beside it as files."""
     numbers = itertools.count()
     at = report.made_at
     statements = [report.origin, report.verification, report.deviations, report.result]
@@ -252,7 +252,7 @@ def _is_hash(text: str) -> bool:
 
 
 def _parts(text: str) -> list[str]:
-    """Parts of a text between which a line may break, for long names without spaces in narrow columns."""
+    """Return parts of a text between which a line may break, for long names without spaces in narrow columns."""
     return [part for part in _LONG_WORD.sub(lambda found: _MEETING.sub("\n", found[0]), text).split("\n") if part]
 
 
@@ -286,7 +286,7 @@ class FigureFile:
 
 
 def figure_files(report: Report, summary: RunSummary) -> list[FigureFile]:
-    """Every figure of a report, numbered by its section, then the tables of errors as CSV."""
+    """Return every figure of a report, numbered by its section, then the tables of errors as CSV."""
     found: list[FigureFile] = []
     for number, section in enumerate(report.sections, 1):
         # If a run calibrates twice, two sections have figures of the same names.
@@ -332,7 +332,7 @@ def _csv(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _plain(cell: str) -> str:
-    """The text, with an apostrophe in front if a spreadsheet would take it for a formula; numbers are unchanged."""
+    """Return the text, with an apostrophe in front if a spreadsheet would take it for a formula; numbers stay."""
     return f"'{cell}" if re.match(r"[=+@\t\r]|-(?![\d.])", cell) else cell
 
 

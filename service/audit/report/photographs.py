@@ -37,7 +37,7 @@ _QUALITY = 76  # so that a report of 36 photographs stays under 3 MB
 
 
 def picture(run: RecordedRun, sha256: str, caption: str, width_px: int, *, upright: bool = False) -> Picture:
-    """A JPEG copy of limited width without the camera's metadata; empty if the file is missing or altered.
+    """Return a JPEG copy of limited width without the camera's metadata; empty if the file is missing or altered.
 
     `upright`: rotate by the orientation tag. Images that are measured are never rotated.
     """
@@ -58,7 +58,7 @@ _PIECE_CHARACTERS = 900
 
 
 def about_facts(run: RecordedRun) -> list[tuple[str, TableCell | str]]:
-    """What was entered when the run began; empty for old runs, which did not ask."""
+    """Return what was entered when the run began; it is empty for old runs, which did not ask."""
     rows: list[tuple[str, TableCell | str]] = []
     for name, value in about_rows(run.root.about):
         rows += [(name if part == 0 else "", text) for part, text in enumerate(_pieces(value))]
@@ -66,12 +66,12 @@ def about_facts(run: RecordedRun) -> list[tuple[str, TableCell | str]]:
 
 
 def _pieces(text: str) -> list[str]:
-    """A long text in parts, because a row of a table has to fit on a page."""
+    """Return a long text in parts, because a row of a table has to fit on a page."""
     return wrap(text, _PIECE_CHARACTERS, replace_whitespace=False, break_on_hyphens=False) or [""]
 
 
 def notes_section(run: RecordedRun, *, with_pictures: bool) -> Section | None:
-    """Every note with its step, time and author, and the photographs; None without any."""
+    """Return every note with its step, time and author, and the photographs; None without any."""
     titles = {step.id: step.title for step in run.protocol.steps}
     notes = [(event, event.payload) for event in run.events if isinstance(event.payload, NoteTaken)]
     if not notes:
@@ -110,7 +110,7 @@ _ORIGINALS = (
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
-    """Overlays of the evaluation, the scene, a contact sheet of the valid captures, and the list of originals.
+    """Return overlays of the evaluation, the scene, a contact sheet of the valid captures, and the list of originals.
 
     `turning`: include the scene that can be turned, which only HTML can show.
     """
@@ -143,7 +143,7 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
 
 
 def _contact_sheets(run: RecordedRun, step: Step) -> tuple[list[Block], list[tuple[str, str, str, str]]]:
-    """The contact sheets of a step, one for each camera, and a row of `_ORIGINALS` for each of their pictures."""
+    """Return a step's contact sheets, one for each camera, and a row of `_ORIGINALS` for each picture of them."""
     blocks: list[Block] = []
     seqs = sorted(run.state.steps[step.id].captured.values())
     captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
@@ -161,7 +161,7 @@ def _contact_sheets(run: RecordedRun, step: Step) -> tuple[list[Block], list[tup
 
 
 def _further(views: Sequence[tuple[int, RecordedView]]) -> dict[str, list[tuple[int, str, FurtherExposure]]]:
-    """The images of each further camera: event, viewpoint, exposure."""
+    """Return the images of each further camera: event, viewpoint, exposure."""
     found: dict[str, list[tuple[int, str, FurtherExposure]]] = {}
     for seq, view in views:
         for one in view.further if isinstance(view, ViewpointCaptured) else ():

@@ -45,7 +45,7 @@ class _Geometry:
         segments: (N, 2, 3) float32, and `strokes`: (N, 3) uint8.
         labels: text and where it stands.
         legend: colour and what it stands for.
-        error_mm: what the first and the last colour of the mesh stand for; None: one colour alone.
+        error_mm: the errors that the first and the last colour of the mesh stand for; None: it has one colour.
     """
 
     points: NDArray[np.float32]
@@ -59,7 +59,7 @@ class _Geometry:
 
 
 def report_scene(summary: RunSummary, *, turning: bool) -> SceneBlock | None:
-    """Cameras, spheres and mesh in one frame; None without a registration. `turning`: also for a browser."""
+    """Return cameras, spheres and mesh in one frame; None without a registration. `turning`: also for a browser."""
     best, registrations = summary.best(), summary.registrations()
     spheres, scan = summary.scan_spheres_m(), summary.scan_mesh_file()
     if best is None or best not in registrations or not spheres or scan is None:
@@ -116,7 +116,7 @@ class _Parts:
         self.strokes.append(np.broadcast_to(_rgb(colour), (len(segments), 3)))
 
     def geometry(self, error_mm: tuple[float, float] | None) -> _Geometry:
-        """All parts as one."""
+        """Return all parts as one."""
         return _Geometry(
             np.concatenate(self.points),
             np.concatenate(self.triangles),
@@ -191,7 +191,7 @@ def _add_scale_bar(parts: _Parts) -> None:
 
 
 def _viridis(share: Array) -> NDArray[np.uint8]:
-    """Colours (N, 3), red first, of the map viridis for shares between 0 and 1."""
+    """Return colours (N, 3), red first, of the map viridis for shares between 0 and 1."""
     grey = np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)[:, None]
     coloured = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
     return np.ascontiguousarray(coloured[:, 0, ::-1])
@@ -218,7 +218,7 @@ class _Camera:
     offset: Array
 
     def project(self, points_mm: Array | NDArray[np.float32]) -> tuple[Array, Array]:
-        """Positions (N, 2) on the sheet, y downwards, and distances (N,)."""
+        """Return positions (N, 2) on the sheet, y downwards, and distances (N,)."""
         seen = (np.asarray(points_mm, dtype=np.float64) - self.eye_mm) @ self.rotation.T
         return self.offset + self.scale * seen[:, :2] / seen[:, 2:], seen[:, 2]
 
@@ -262,7 +262,7 @@ def _drawing(geometry: _Geometry, text: str, rows: tuple[tuple[str, ...], ...]) 
 
 
 def _scale(error_mm: tuple[float, float], y: float) -> list[Shape]:
-    """The colour scale of the mesh, at the right end of the legend."""
+    """Return the colour scale of the mesh, at the right end of the legend."""
     width, steps = 140.0, 35
     x = _WIDTH - width - 92
     shapes: list[Shape] = [Label(x - 62, y, "predicted error", 13, anchor="end")]
@@ -274,7 +274,7 @@ def _scale(error_mm: tuple[float, float], y: float) -> list[Shape]:
 
 
 def _painted(geometry: _Geometry, camera: _Camera) -> bytes:
-    """The surfaces as PNG, painted from the farthest to the nearest triangle."""
+    """Return the surfaces as PNG, painted from the farthest to the nearest triangle."""
     grown = _SUPERSAMPLED
     canvas = np.full((int(_HEIGHT * grown), int(_WIDTH * grown), 3), _BACK, np.uint8)
     places, distances = camera.project(geometry.points)
@@ -292,7 +292,7 @@ def _painted(geometry: _Geometry, camera: _Camera) -> bytes:
 
 
 def _rows(scene: scene_view.Scene) -> tuple[tuple[str, ...], ...]:
-    """The positions of cameras and spheres in the scan's frame, as rows of a table."""
+    """Return the positions of cameras and spheres in the scan's frame, as rows of a table."""
     head = ("what", "name", "station", "x_mm", "y_mm", "z_mm", "axis_x", "axis_y", "axis_z")
     rows: list[tuple[str, ...]] = [head]
     for name, T in sorted(scene.cameras.items()):
@@ -305,7 +305,7 @@ def _rows(scene: scene_view.Scene) -> tuple[tuple[str, ...], ...]:
 
 
 def _place(T: Transform) -> tuple[str, ...]:
-    """A camera's position and optical axis."""
+    """Return a camera's position and optical axis."""
     return (*_numbers(mm(T[:3, 3]), 4), *_numbers(T[:3, 2], 6))
 
 
@@ -317,7 +317,7 @@ def _numbers(values: Array, digits: int) -> tuple[str, ...]:
 
 
 def _turned(geometry: _Geometry) -> str:
-    """A canvas over the drawing, except its legend, and the data that templates/scene.js draws on it."""
+    """Return a canvas over the drawing, except its legend, and the data that templates/scene.js draws on it."""
     wide = len(geometry.points) > 0xFFFF
     data: Mapping[str, object] = {
         "points": _packed(geometry.points),

@@ -46,7 +46,7 @@ class ComparedRun:
 
 @dataclass(frozen=True, slots=True)
 class ComparedProperty:
-    """One property of both runs, in words; `change`: from the first to the second, "" if there is none."""
+    """One property of both runs as text; `change`: from the first to the second, "" if there is none."""
 
     name: str
     first: str
@@ -92,7 +92,7 @@ def compare_runs(first: ComparedRun, second: ComparedRun) -> RunComparison:
 
 
 def root_of(events: Sequence[Event]) -> RunStarted:
-    """The first event of a run. Raises IntegrityError if it is not run_started."""
+    """Return the first event of a run. Raises IntegrityError if it is not run_started."""
     root = events[0].payload if events else None
     if not isinstance(root, RunStarted):
         raise IntegrityError("the run's first event is not run_started", where=events[0].run_id if events else "")
@@ -117,7 +117,7 @@ def _about(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty
 
 
 def _steps(first: ComparedRun, second: ComparedRun) -> list[tuple[str, str]]:
-    """Identifier and title of every step, in the order of the first run; steps of the second alone come last."""
+    """Return identifier and title of every step, as the first run orders them; steps of the second alone are last."""
     titles = {step.id: step.title for run in (second, first) for step in run.protocol.steps}
     return [(name, titles[name]) for name in dict.fromkeys([*first.protocol.step_ids, *second.protocol.step_ids])]
 
@@ -160,7 +160,7 @@ def _unit(name: str) -> str:
 
 
 def _change(values: Sequence[float | None], unit: str = "") -> str:
-    """The change in words, such as `+0.012 mm`; "" if a value is missing or both are equal."""
+    """Return the change as text, such as `+0.012 mm`; "" if a value is missing or both are equal."""
     first, second = values
     if first is None or second is None or not math.isfinite(apart := second - first) or apart == 0:
         return ""
@@ -226,7 +226,7 @@ class _Calibrated:
     measures: Mapping[str, float]
 
     def parameter(self, name: str) -> float | None:
-        """A parameter of the camera; None where it was not recorded."""
+        """Return a parameter of the camera; None where it was not recorded."""
         if self.camera is None or name not in self.camera.model_fields_set:
             return None
         return float(getattr(self.camera, name))

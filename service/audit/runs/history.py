@@ -27,7 +27,7 @@ class Figure:
     name: str
     unit: str
     of: tuple[InstrumentKind, ...]
-    from_zero: bool = True  # whether its axis begins at 0; a focal length changes by a thousandth only
+    from_zero: bool = True  # its axis starts at 0; a focal length changes by a thousandth only
 
 
 FIGURES: tuple[Figure, ...] = (
@@ -54,7 +54,7 @@ _COLUMNS = (*_MEASURED, *(f"{name}_px" for name in _OF_CAMERA), "mean_radial_err
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """A camera, lens or arm by the maker's model and serial number; "" if not stated."""
+    """A camera, lens or arm by the maker's model and serial number; "" if not known."""
 
     kind: InstrumentKind
     model: str
@@ -74,16 +74,16 @@ class HistoryRow:
     at_utc: str
     camera: Instrument | None
     lens: Instrument | None
-    arms: tuple[Instrument, ...]  # whose flange carried the camera
+    arms: tuple[Instrument, ...]  # the arms whose flange carried the camera
     values: Mapping[str, float]
 
     def instruments(self) -> tuple[Instrument, ...]:
-        """All instruments of the run."""
+        """Return all instruments of the run."""
         return tuple(one for one in (self.camera, self.lens, *self.arms) if one is not None)
 
 
 def history(store: Store) -> list[HistoryRow]:
-    """Every run with a calibration or an accuracy, oldest first."""
+    """Return every run with a calibration or an accuracy, oldest first."""
     runs = find_runs(store, RunSearch())[::-1]
     with store.database.reading() as connection:
         calibrations = _calibrations(connection)
@@ -107,7 +107,7 @@ def history(store: Store) -> list[HistoryRow]:
 
 
 def by_instrument(rows: Sequence[HistoryRow]) -> dict[Instrument, list[HistoryRow]]:
-    """The rows of each instrument: cameras, then lenses, then arms, each sorted by model and serial number."""
+    """Return the rows of each instrument: cameras, then lenses, then arms, each sorted by model and serial number."""
     found: dict[Instrument, list[HistoryRow]] = defaultdict(list)
     for row in rows:
         for instrument in row.instruments():
@@ -153,7 +153,7 @@ def _calibrations(connection: Connection) -> dict[str, tuple[_CalibrationResult,
 
 
 def _devices(connection: Connection) -> dict[str, dict[str, RecordedIdentity]]:
-    """By run and name in rig.yaml: the identity that a device stated when it was last opened."""
+    """Return by run and name in rig.yaml the identity that a device reported when it was last opened."""
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.device') AS device, "
@@ -170,7 +170,7 @@ def _devices(connection: Connection) -> dict[str, dict[str, RecordedIdentity]]:
 
 
 def _optics(connection: Connection) -> dict[str, RecordedOptics]:
-    """By run: what the first photograph states of camera and lens."""
+    """Return by run what the first photograph states of camera and lens."""
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM runs AS r CROSS JOIN events AS e "
@@ -197,7 +197,7 @@ def _values(steps: Iterable[_CalibrationResult]) -> dict[str, float]:
 def _optical(
     devices: Mapping[str, RecordedIdentity], stated: RecordedOptics
 ) -> tuple[Instrument | None, Instrument | None]:
-    """Camera and lens as the photographs state them, else as the camera stated when it was opened."""
+    """Return the camera and lens as the photographs state them, else as the camera reported when it was opened."""
     cameras = (one for name, one in devices.items() if one.kind == "camera" or name == "camera")
     answered = next(cameras, RecordedIdentity())
     model, serial = stated.model or answered.model, stated.body_serial or answered.serial
@@ -208,7 +208,7 @@ def _optical(
 
 
 def _arms(devices: Mapping[str, RecordedIdentity], steps: Sequence[_CalibrationResult]) -> tuple[Instrument, ...]:
-    """The arms that the calibration names; if it names none, every arm that was opened."""
+    """Return the arms that the calibration names; if it names none, every arm that was opened."""
     named = dict.fromkeys(robot for step in steps for robot in step.robots)
     names = named or [name for name, i in devices.items() if i.kind == "robot" or name.startswith("robot")]
     arms = (devices[name] for name in names if name in devices)
@@ -219,7 +219,7 @@ def _arms(devices: Mapping[str, RecordedIdentity], steps: Sequence[_CalibrationR
 
 
 def history_csv(rows: Sequence[HistoryRow]) -> str:
-    """The rows as CSV (RFC 4180) with a header line; units are in the names."""
+    """Return the rows as CSV (RFC 4180) with a header line; units are in the names."""
     out = io.StringIO()
     writer = csv.writer(out)
     about = ("run", "at_utc", "simulated", "state", "specimen", "purpose", "site", "protocol", "version")
@@ -243,5 +243,5 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
 
 
 def _harmless(word: str) -> str:
-    """The text, with an apostrophe in front if a spreadsheet would take it for a formula."""
+    """Return the text, with an apostrophe in front if a spreadsheet would take it for a formula."""
     return f"'{word}" if word.startswith(("=", "+", "-", "@", "\t")) else word

@@ -40,11 +40,11 @@ class RunSearch:
 
     @property
     def active(self) -> bool:
-        """Whether any field is set."""
+        """True if any field is set."""
         return any((self.q.strip(), self.since, self.until, self.result))
 
     def query(self) -> dict[str, str]:
-        """The search as query parameters of a link."""
+        """Return the search as query parameters of a link."""
         fields = {"q": self.q, "since": self.since, "until": self.until, "result": self.result}
         return {name: value for name, value in fields.items() if value}
 
@@ -81,7 +81,7 @@ class FoundRun:
     accuracy: Accuracy | None
 
     def has(self, result: str) -> bool:
-        """Whether it has this result, one of RESULTS."""
+        """Return whether the run has this result, one of RESULTS."""
         if result == "released":
             return self.released
         if result in ("within", "outside"):
@@ -97,7 +97,7 @@ class FoundRun:
 
 
 def find_runs(store: Store, wanted: RunSearch) -> list[FoundRun]:
-    """The runs that match, newest first. If a first event cannot be read, its fields are empty."""
+    """Return the runs that match, newest first. If a first event cannot be read, its fields are empty."""
     with store.database.reading() as connection:
         every = _every(connection)
     terms = wanted.q.casefold().split()

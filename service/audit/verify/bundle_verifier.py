@@ -99,7 +99,7 @@ _ESCAPED = re.compile(r'[\x00-\x1f"\\]')
 
 
 def canonical(value: Any) -> bytes:
-    """RFC 8785 canonical JSON. Raises ValueError for what has none."""
+    """Return RFC 8785 canonical JSON. Raises ValueError for what has none."""
     parts: list[str] = []
     _write(value, parts)
     return "".join(parts).encode("utf-8")  # a lone surrogate raises UnicodeEncodeError, which is a ValueError
@@ -138,7 +138,7 @@ def _string(text: str) -> str:
 
 
 def number(value: float) -> str:
-    """A double as ECMAScript writes it (Number::toString): the shortest digits that read back as the same."""
+    """Return a double as ECMAScript writes it (Number::toString): the shortest digits that read back as the same."""
     if not math.isfinite(value):
         raise ValueError(f"{value} has no JSON form")
     if value == 0:
@@ -167,12 +167,12 @@ def number(value: float) -> str:
 
 
 def short_words(error: Exception) -> str:
-    """What an error says, without the bytes that some carry along."""
+    """Return an error's type and message, cut to 200 characters because some messages carry bytes along."""
     return f"{type(error).__name__}: {error}"[:200]
 
 
 def parse(text: bytes) -> Any:
-    """JSON without duplicate names, NaN and infinity. Raises ValueError."""
+    """Return JSON without duplicate names, NaN and infinity. Raises ValueError."""
     try:
         found = json.loads(
             text.decode("utf-8"), object_pairs_hook=_pairs, parse_int=_integer, parse_constant=_constant
@@ -219,11 +219,11 @@ class Bundle:
     left_by_others: Sequence[str] = ()
 
     def open(self, name: str) -> IO[bytes]:
-        """A stream of one file."""
+        """Return a stream of one file."""
         raise NotImplementedError
 
     def read(self, name: str, limit: int) -> bytes:
-        """A small file as a whole. Raises ValueError when it is longer than it may be."""
+        """Return a small file as a whole. Raises ValueError when it is longer than it may be."""
         with self.open(name) as stream:
             content = stream.read(limit + 1)
         if len(content) > limit:
@@ -231,7 +231,7 @@ class Bundle:
         return content
 
     def lines(self, name: str) -> Iterator[bytes]:
-        """The lines of a file without their ends. Raises ValueError for one that is too long or not ended."""
+        """Yield the lines of a file without their ends. Raises ValueError for one that is too long or not ended."""
         with self.open(name) as stream:
             while line := stream.readline(LARGEST_LINE):
                 if not line.endswith(b"\n"):
@@ -288,7 +288,7 @@ def _offset(listed: tuple[zipfile.ZipInfo, bytes]) -> int:
 
 
 class ZipLayout:
-    """Where the parts of a zip file lie. Entries and directory must cover it without a gap, as they were written."""
+    """The layout of a zip file's parts. Entries and directory must cover it without a gap, as they were written."""
 
     _END, _END_64, _LOCATOR_64 = b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
     _CENTRAL, _LOCAL = b"PK\x01\x02", b"PK\x03\x04"
@@ -300,7 +300,7 @@ class ZipLayout:
         self._size = size
 
     def problems(self, infos: Sequence[zipfile.ZipInfo]) -> list[str]:
-        """What keeps this from being exactly one zip file."""
+        """List what keeps this from being exactly one zip file."""
         try:
             start, end, count = self._directory()
             names = self._directory_names(start, end)
@@ -315,7 +315,7 @@ class ZipLayout:
         return self._stream.read(size)
 
     def _directory(self) -> tuple[int, int, int]:
-        """Where the directory begins and ends, and how many files it lists. Raises ValueError."""
+        """Return where the directory begins and ends, and how many files it lists. Raises ValueError."""
         end = self._size - 22
         last = self._at(max(end, 0), 22)
         if not last.startswith(self._END) or last[20:] != b"\0\0":
@@ -337,7 +337,7 @@ class ZipLayout:
         return start, end, count
 
     def _directory_names(self, start: int, end: int) -> list[bytes]:
-        """The names in the directory, as bytes. Raises ValueError, struct.error."""
+        """Return the names in the directory, as bytes. Raises ValueError, struct.error."""
         names: list[bytes] = []
         while start < end:
             head = self._at(start, 46)
@@ -354,7 +354,7 @@ class ZipLayout:
         return names
 
     def _check_extra(self, extra: bytes) -> bytes:
-        """The sizes beyond 4 GB among the extra fields. Raises ValueError, struct.error."""
+        """Return the sizes beyond 4 GB among the extra fields. Raises ValueError, struct.error."""
         sizes = b""
         while extra:
             kind, size = struct.unpack("<2H", extra[:4])
@@ -366,7 +366,7 @@ class ZipLayout:
         return sizes
 
     def _entry_problems(self, infos: Sequence[zipfile.ZipInfo], names: Sequence[bytes], end: int) -> list[str]:
-        """Entries that do not follow each other, or whose own header differs from the directory."""
+        """Return entries that do not follow each other, or whose own header differs from the directory."""
         found: list[str] = []
         position = 0
         for info, name in sorted(zip(infos, names), key=_offset):  # noqa: B905 - not in 3.9
@@ -421,7 +421,7 @@ class FolderBundle(Bundle):
 
 
 def name_problem(name: str) -> str:
-    """Why a name must not be in a bundle (it could lead out of the folder it is unpacked to); "" for a good one."""
+    """Return why a name must not be in a bundle (it could lead out of the unpacked folder); "" for a good one."""
     if not name or "\\" in name or "\x00" in name or name.startswith("/") or re.match(r"[A-Za-z]:", name):
         return "the name leads out of the bundle, or is none"
     if any(part in ("", ".", "..") for part in name.rstrip("/").split("/")):
@@ -441,7 +441,7 @@ def _entry_problem(info: zipfile.ZipInfo) -> str:
 
 
 def _stream_problem(stream: IO[bytes], info: zipfile.ZipInfo) -> str:
-    """Why the bytes of an entry are not exactly its content, with nothing behind it; "" if they are."""
+    """Return why the bytes of an entry are not exactly its content, with nothing behind it; "" if they are."""
     if info.compress_type == zipfile.ZIP_STORED:
         return "" if info.compress_size == info.file_size else "it is stored with another size than it has"
     stream.seek(info.header_offset + 26)
@@ -469,7 +469,7 @@ def _stream_problem(stream: IO[bytes], info: zipfile.ZipInfo) -> str:
 class Check:
     """One pass over a bundle: faults and notes, in the order in which they were found."""
 
-    files: dict[str, tuple[str, int]]  # as the manifest lists them
+    files: dict[str, tuple[str, int]]  # the files as the manifest lists them
 
     def __init__(self) -> None:
         self.faults: list[dict[str, str]] = []
@@ -479,11 +479,11 @@ class Check:
         self.counts: dict[str, int] = {}
 
     def fault(self, where: str, what: str) -> None:
-        """Something that is not as it should be."""
+        """Note something that is not as it should be."""
         self.faults.append({"where": where, "what": what})
 
     def run(self, path: Path, key: str | None, certificates: Path | None) -> None:
-        """Everything. Raises NotABundleError."""
+        """Verify everything. Raises NotABundleError."""
         if not path.exists():
             raise NotABundleError(f"{path} is not there")
         bundle = FolderBundle(path, self.fault) if path.is_dir() else ZipBundle(path, self.fault)
@@ -576,7 +576,7 @@ class Check:
         return digest.hexdigest()
 
     def records(self, bundle: Bundle, name: str, whole: frozenset[str]) -> Iterator[dict[str, Any]]:
-        """The lines of a file of records, each canonical JSON."""
+        """Yield the lines of a file of records, each canonical JSON."""
         if name not in whole:
             return
         try:
@@ -916,14 +916,14 @@ class Chain:
 
 
 def _heads(value: Any) -> dict[str, tuple[int, str]]:
-    """Ends of chains as recorded when the service started; what is not one is left out, and the hash reveals it."""
+    """Return ends of chains as recorded at a start of the service, without malformed ones: the hash shows them."""
     found = value.items() if isinstance(value, dict) else ()
     pairs = {run: end for run, end in found if isinstance(end, list) and len(end) == 2}
     return {run: (end[0], end[1]) for run, end in pairs.items() if isinstance(end[0], int)}
 
 
 def references_in(value: Any) -> Iterator[dict[str, Any]]:
-    """Every reference to a file anywhere within a payload."""
+    """Yield every reference to a file anywhere within a payload."""
     if isinstance(value, dict):
         if value.keys() == REFERENCE:
             yield value
@@ -936,13 +936,13 @@ def references_in(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def statement(item: Mapping[str, Any]) -> bytes:
-    """What a checkpoint signs."""
+    """Return the bytes that a checkpoint's signature covers."""
     named = {name: value for name, value in item.items() if name != "signature"}
     return canonical(dict(named, purpose=CHECKPOINT))
 
 
 def signature_fits(item: Mapping[str, Any], raw: bytes) -> bool:
-    """Whether a checkpoint is signed by this key."""
+    """Return whether a checkpoint is signed by this key."""
     try:
         signature = base64.b64decode(str(item.get("signature")), validate=True)
     except ValueError:
@@ -951,7 +951,7 @@ def signature_fits(item: Mapping[str, Any], raw: bytes) -> bool:
 
 
 def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
-    """Whether a signature is this key's over this message."""
+    """Return whether a signature is this key's over this message."""
     try:
         Ed25519PublicKey.from_public_bytes(raw).verify(signature, message)
     except (InvalidSignature, ValueError):
@@ -960,7 +960,7 @@ def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
 
 
 def in_use(item: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
-    """Whether a key was in use when an item was signed. A key's last act is to sign the key that replaces it."""
+    """Return whether a key was in use when an item was signed. Its last act is to sign the key that replaces it."""
     at, replaced = item["site_seq"], key["replaced_seq"]
     if replaced is None or at < replaced:
         return bool(at >= key["seq"])
@@ -999,7 +999,7 @@ class DerValue:
         self.whole = data[start : self.end]
 
     def children(self) -> list[DerValue]:
-        """The values within."""
+        """Return the values within."""
         found: list[DerValue] = []
         at = 0
         while at < len(self.content):
@@ -1008,7 +1008,7 @@ class DerValue:
         return found
 
     def oid(self) -> str:
-        """An object identifier as text."""
+        """Return an object identifier as text."""
         numbers = [self.content[0] // 40, self.content[0] % 40]
         value = 0
         for byte in self.content[1:]:
@@ -1109,7 +1109,7 @@ def _digest(algorithm: str, message: bytes) -> bytes:
 
 
 def load_certificates(path: Path | None) -> list[x509.Certificate]:
-    """The certificates of a PEM file. Raises NotABundleError."""
+    """Return the certificates of a PEM file. Raises NotABundleError."""
     if path is None:
         return []
     try:
@@ -1160,7 +1160,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def report(check: Check) -> str:
-    """The result in words."""
+    """Return the result as text."""
     counts = check.counts
     simulated = " SIMULATED: no real device took part." if check.manifest["simulated"] else ""
     lines = [
@@ -1180,7 +1180,7 @@ def report(check: Check) -> str:
 
 
 def shown(text: str) -> str:
-    """One line, with every character escaped that a terminal would obey: an attacker may have chosen the names."""
+    """Return one line with every character escaped that a terminal would obey: an attacker may choose names."""
     return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

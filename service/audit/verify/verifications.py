@@ -1,4 +1,4 @@
-"""Verifications started in the browser: each is done by a process of its own, and the result is kept in a file.
+"""Verifications started in the browser: each is done by a process of its own, and the result is stored in a file.
 
 The result is a note beside the data, not evidence: if in doubt, verify again.
 """
@@ -31,14 +31,14 @@ class VerifiedFault(Record):
 
 
 class Outcome(Record):
-    """What a verification found."""
+    """The findings of a verification."""
 
     ok: bool
     events: int
     artefacts: int
     files: int
     bytes_hashed: int
-    head_sha256: str  # of the last event that it covered
+    head_sha256: str  # hash of the last event that it covered
     faults: tuple[VerifiedFault, ...]
     fault_count: int
     notes: tuple[str, ...]
@@ -62,7 +62,7 @@ def keep_verification(data: Path, run_id: str, kept: Verification) -> None:
 
 
 def verification_of(report: AuditReport, run_id: str, *, by: str, at_utc: str, duration_s: float) -> Verification:
-    """The result for one run of a report; the counts are those of all runs that were verified together."""
+    """Return the result for one run of a report; the counts are those of all runs that were verified together."""
     faults = [fault for fault in report.faults if fault.run_id in (None, run_id)]
     together = [f"verified together with {len(report.runs) - 1} other runs"] if len(report.runs) > 1 else []
     return Verification(
@@ -94,14 +94,14 @@ class Verifications:
         self._children = ChildProcesses("service.audit.verify.verifications", "verification", clock)
 
     def last(self, run_id: str) -> Verification | None:
-        """The last result; None if there is none that can be read."""
+        """Return the last result; None if there is none that can be read."""
         try:
             return Verification.model_validate_json(_path(self._data, run_id).read_bytes())
         except (OSError, ValidationError):
             return None
 
     def running(self, run_id: str) -> ChildState | None:
-        """The state of the present verification; `problem` says why the last one gave no result."""
+        """Return the state of the present verification; `problem` says why the last one gave no result."""
         state = self._children.state(run_id)
         return state if state is not None and state.result is None else None
 

@@ -82,7 +82,7 @@ def _pose(view: PosedView) -> dict[str, Any]:
 
 
 def _extent(vertices_mm: Array) -> dict[str, float]:
-    """Box and diameter, which is the largest distance between two vertices."""
+    """Return the box and diameter, which is the largest distance between two vertices."""
     low, size = vertices_mm.min(axis=0), np.ptp(vertices_mm, axis=0)
     corners = vertices_mm[ConvexHull(vertices_mm, qhull_options="QJ").vertices]
     diameter = max(float(cdist(corners[k : k + 500], corners).max()) for k in range(0, len(corners), 500))

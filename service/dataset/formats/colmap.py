@@ -89,12 +89,12 @@ def _points(points_m: Array) -> bytes:
 
 
 def camera_ids(views: Sequence[PosedView]) -> dict[CameraModel, int]:
-    """A number from 1 for each different camera."""
+    """Return a number from 1 for each different camera."""
     return {camera: k for k, camera in enumerate(dict.fromkeys(view.camera for view in views), start=1)}
 
 
 def model_of(camera: CameraModel) -> tuple[str, list[float]]:
-    """COLMAP's name of the camera's model, and its parameters."""
+    """Return COLMAP's name of the camera's model, and its parameters."""
     pinhole = [camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL]
     if not camera.distortion.any():
         return "PINHOLE", pinhole
@@ -104,7 +104,7 @@ def model_of(camera: CameraModel) -> tuple[str, list[float]]:
 
 
 def world_to_camera(T_world_camera: Transform) -> tuple[Array, Array]:
-    """Quaternion (4,) with the scalar first, and translation (3,)."""
+    """Return the quaternion (4,) with the scalar first, and translation (3,)."""
     T = inverse(T_world_camera)
     return Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True), T[:3, 3]
 
@@ -169,7 +169,7 @@ def write_sugar(dataset: DataSet, folder: ExportFolder) -> None:
 
 
 def first_points(mesh: Mesh) -> Array:
-    """(N, 3) random points in the box of the mesh, always the same ones."""
+    """Return (N, 3) random points in the box of the mesh, always the same ones."""
     low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
     return np.random.default_rng(0).uniform(low, high, (_POINTS, 3))
 

@@ -22,7 +22,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 
 
 def glb(dataset: DataSet) -> bytes:
-    """The file, as Khronos' specification of glTF 2.0 describes it."""
+    """Return the file, as Khronos' specification of glTF 2.0 describes it."""
     points = dataset.mesh.vertices_m.astype("<f4")
     blob = points.tobytes() + dataset.mesh.faces.astype("<u4").tobytes()
     split = points.nbytes
@@ -63,12 +63,12 @@ def _chunk(kind: bytes, data: bytes, filler: bytes) -> bytes:
 
 
 def _node(number: int, view: PosedView) -> dict[str, Any]:
-    """The pose with OpenGL's axes; matrices are stored column by column."""
+    """Return the pose with OpenGL's axes; matrices are stored column by column."""
     return {"name": view.name, "camera": number, "matrix": (view.T_world_camera @ OPENGL).T.ravel().tolist()}
 
 
 def _camera(view: PosedView) -> dict[str, Any]:
-    """A symmetric pinhole: glTF has neither a principal point nor distortion."""
+    """Return a symmetric pinhole: glTF has neither a principal point nor distortion."""
     camera = view.camera
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),

@@ -67,7 +67,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 
 
 class _DepthOfViews:
-    """What is computed from the views' depth, once and only when a file needs it."""
+    """The data computed from the views' depth, once and only when a file needs it."""
 
     def __init__(self, dataset: DataSet) -> None:
         self._dataset = dataset
@@ -76,7 +76,7 @@ class _DepthOfViews:
         self._surface = Surface(mesh.vertices_m, mesh.faces)
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """(H, W) of the surface where the image shows it; what it shows of the surface's points is kept."""
+        """Return the depth (H, W) of the surface where the image shows it, and note which of its points it shows."""
         pixels = self._dataset.pixels
         shown = pixels.valid(view) & ~pixels.markers(view)
         depth = np.where(shown, pixels.depth_m(view), np.float32(0.0))
@@ -85,7 +85,7 @@ class _DepthOfViews:
 
     @cached_property
     def covisible(self) -> Covisibility:
-        """Of all views."""
+        """The covisibility of all views."""
         for view in self._dataset.views:
             if view.name not in self._seen:  # an interrupted export wrote its depth
                 self.depth_m(view)
@@ -153,12 +153,12 @@ def _table(dataset: DataSet, pairs: list[ListedPair]) -> bytes:
 
 
 def _sigma(covariance: NDArray[np.float64]) -> float:
-    """Expected length of an error in space with this covariance (3, 3)."""
+    """Return the expected length of an error in space with this covariance (3, 3)."""
     return float(np.sqrt(np.trace(covariance)))
 
 
 def _graph(dataset: DataSet, covisible: Covisibility) -> dict[str, object]:
-    """Views as nodes with the points that they see, pairs as edges with the points of both, and connected parts."""
+    """Return the graph: views as nodes with their points, pairs as edges with common points, and connected parts."""
     names = [view.name for view in dataset.views]
     edges = covisible.pairs()
     return {

@@ -73,7 +73,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 
 
 def stamps_ns(views: Sequence[PosedView]) -> dict[str, int]:
-    """The stamp of each view, ns since 1970: of its photograph; counted if one lacks or repeats its time."""
+    """Return each view's stamp, ns since 1970, of its photograph; counted if a time is missing or repeated."""
     taken = {view.name: _time_ns(view.taken) for view in views}
     known = {name: stamp for name, stamp in taken.items() if stamp is not None}
     if len(set(known.values())) == len(views):
@@ -119,7 +119,7 @@ def _recording(path: Path, dataset: DataSet, stamps: dict[str, int]) -> None:
 
 
 def _messages(dataset: DataSet, stamps: dict[str, int]) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, stamp and bytes of every message, in order of time."""
+    """Yield the topic, stamp and bytes of every message, in order of time."""
     static = StampedTransform(min(stamps.values()), WORLD, SCAN, np.eye(4))
     yield "/tf_static", static.stamp_ns, encode_tf([static])
     for view in sorted(dataset.views, key=lambda view: stamps[view.name]):
@@ -132,7 +132,7 @@ def _messages(dataset: DataSet, stamps: dict[str, int]) -> Iterator[tuple[str, i
 
 
 def _metadata(stamps: dict[str, int]) -> str:
-    """The description that rosbag2 puts beside its file."""
+    """Return the description that rosbag2 puts beside its file."""
     first, last = min(stamps.values()), max(stamps.values())
     counts = {topic: 1 if topic == "/tf_static" else len(stamps) for topic in TOPICS}
     start, length = {"nanoseconds_since_epoch": first}, {"nanoseconds": last - first}

@@ -14,13 +14,13 @@ from service.dataset.records import Mesh
 
 
 def ply(vertices: Array, faces: NDArray[np.int64], comment: str) -> bytes:
-    """A binary PLY with vertices (V, 3) in double precision and faces (F, 3), in the vertices' own unit."""
+    """Return a binary PLY with vertices (V, 3) in double precision and faces (F, 3), in the vertices' own unit."""
     columns = {name: vertices[:, k].astype("<f8") for k, name in enumerate("xyz")}
     return ply_bytes(columns, faces, [comment] if comment else [])
 
 
 def ground_truth_ply(mesh: Mesh, comment: str) -> bytes:
-    """A binary PLY of the ground truth in metres; if they are known, with `source` and `sigma_m` of each vertex."""
+    """Return a binary PLY of the ground truth in metres, with `source` and `sigma_m` of each vertex if known."""
     columns: dict[str, NDArray[np.generic]] = {
         name: mesh.vertices_m[:, k].astype("<f8") for k, name in enumerate("xyz")
     }
@@ -32,7 +32,7 @@ def ground_truth_ply(mesh: Mesh, comment: str) -> bytes:
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16], mark: str = "") -> bytes:
-    """A PNG of (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA values; a mark is its description.
+    """Return a PNG of (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA values; a mark is its description.
 
     Raises:
         DataError: it cannot be encoded.
@@ -44,5 +44,5 @@ def png(image: NDArray[np.uint8] | NDArray[np.uint16], mark: str = "") -> bytes:
 
 
 def mask_png(mask: NDArray[np.bool_], mark: str) -> bytes:
-    """A PNG with 255 where the mask (H, W) is true and 0 elsewhere."""
+    """Return a PNG with 255 where the mask (H, W) is true and 0 elsewhere."""
     return png(np.where(mask, np.uint8(255), np.uint8(0)), mark)

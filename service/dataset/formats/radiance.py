@@ -29,13 +29,13 @@ class UnitBox:
     scale: float  # 1/m
 
     def pose(self, T_world_camera: Transform) -> Transform:
-        """The pose with its position relative to the centre, still in metres."""
+        """Return the pose with its position relative to the centre, still in metres."""
         T = T_world_camera.copy()
         T[:3, 3] -= self.centre_m
         return T
 
     def record(self, dataset: DataSet, mesh_axes: tuple[int, int, int]) -> dict[str, object]:
-        """As JSON, to bring a saved mesh to the world: scale, centre, and which of its axes are the world's x, y, z.
+        """Return JSON data to bring a saved mesh to the world: scale, centre, and which axes are the world's x, y, z.
 
         The programs undo the scale when they save a mesh, so only the centre has to be added.
         """
@@ -50,7 +50,7 @@ class UnitBox:
 
 
 def unit_box(mesh: Mesh, fill: float = 0.9) -> UnitBox:
-    """The box about a mesh whose longest extent fills this share of the box's edge."""
+    """Return the box about a mesh whose longest extent fills this share of the box's edge."""
     low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
     return UnitBox((low + high) / 2, fill / float((high - low).max()))
 

@@ -41,7 +41,7 @@ class BackupReport:
     """The result of a backup."""
 
     folder: Path
-    name: str  # of the state, for `orthocapture store restore --state NAME`
+    name: str  # the state's name, for `orthocapture store restore --state NAME`
     state: BackupState
     copied: int  # number of files copied this time
     copied_bytes: int
@@ -50,11 +50,11 @@ class BackupReport:
 
 @dataclass(frozen=True, slots=True)
 class BackupOptions:
-    """What a backup does besides copying what is new.
+    """The options of a backup, besides copying what is new.
 
     Attributes:
-        with_keys: also copy the private signing key.
-        read_all: hash again every file that earlier backups copied, and copy altered ones again.
+        with_keys: true to copy the private signing key, too.
+        read_all: true to hash again every file that earlier backups copied, and to copy altered ones again.
         keep: number of newest states to keep; None keeps all. If this state has faults, none is discarded.
     """
 
@@ -80,8 +80,8 @@ def back_up(
     Args:
         data_dir: the data folder, which a run may be using.
         destination: the folder of backups: new, empty, or with earlier backups of this data folder.
-        options: what else to do.
-        progress: called with the number of bytes copied.
+        options: the backup's options.
+        progress: a function that is called with the number of bytes copied.
         files: durable file operations.
         clock: gives the state its name.
 
@@ -113,12 +113,12 @@ def _silent(_what: str, _done: int, _total: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _ReferencedFiles:
-    """What the copied database refers to."""
+    """The files, chains and journal line that the copied database refers to."""
 
     sizes: dict[str, int]  # sizes of files, by hash
     heads: dict[str, tuple[int, str]]
     root_sha256: str
-    line: int  # of the journal
+    line: int  # number of the journal's line
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class _Backup:
                 self.folder.discard(self.folder.path(old))
 
     def _read_copy(self, part: Path) -> tuple[_ReferencedFiles, set[tuple[str, int]]]:
-        """What the copied database refers to, and the (run, seq) of its signatures."""
+        """Return what the copied database refers to, and the (run, seq) of its signatures."""
         copy = open_read_only(part, self.folder.files)
         try:
             with copy.reading() as connection:
@@ -206,7 +206,7 @@ class _Backup:
     def _copy_journal(self, part: Path, line: int) -> str:
         """Copy the journal up to the line that the database copy holds. Returns the copy's SHA-256; "" without lines.
 
-        A journal that lacks the line, or was altered, is copied as it is, for the audit to find.
+        A journal without the line, or an altered one, is copied as it is, for the audit to find.
         """
         journal = self.data_dir / JOURNAL_NAME
         if not line or not journal.is_file():
@@ -250,7 +250,10 @@ class _Backup:
             )
 
     def _missing(self, sizes: dict[str, int]) -> list[str]:
-        """Hashes of the files to copy. Removes damaged copies, of wrong size or, with `read_all`, wrong content."""
+        """Return hashes of the files to copy.
+
+        Removes damaged copies, of wrong size or, with `read_all`, wrong content.
+        """
         found: list[str] = []
         total, done = sum(sizes.values()), 0
         for sha256, size in sizes.items():
@@ -323,7 +326,7 @@ class _Backup:
 
 
 def _fault_of(source: Path, sha256: str) -> str:
-    """What is wrong with a file of the data folder; "" if nothing is."""
+    """Return what is wrong with a file of the data folder; "" if nothing is."""
     shown = f"artefacts/{relative_path(sha256)}"
     try:
         return "" if hash_file(source)[0] == sha256 else f"{shown}: the file was altered; it is not in the backup"

@@ -35,7 +35,7 @@ _SAYS = {"format": 1, "purpose": "backups of one orthocapture data folder"}
 
 
 class BackupState(Record):
-    """What one backup holds; written last."""
+    """The content of one backup; written last."""
 
     format: Literal[1] = 1
     at_utc: str
@@ -47,9 +47,9 @@ class BackupState(Record):
     artefacts: int
     artefact_bytes: int
     heads: dict[str, tuple[int, str]]  # chain → number and hash of its last event
-    root_sha256: str  # of the oldest chain; identifies the data folder
+    root_sha256: str  # root hash of the oldest chain, which identifies the data folder
     with_keys: bool
-    faults: tuple[str, ...]  # in the data folder itself when it was copied; () if it verified
+    faults: tuple[str, ...]  # faults of the data folder itself when it was copied; () if it verified
 
 
 @contextmanager
@@ -130,16 +130,19 @@ class BackupFolder:
             yield
 
     def states(self) -> list[str]:
-        """Names of the complete backups, oldest first."""
+        """Return names of the complete backups, oldest first."""
         found = (self.folder / STATES).glob(f"*/{STATE_FILE}")
         return sorted(path.parent.name for path in found if path.parent.suffix != PART)
 
     def path(self, name: str) -> Path:
-        """The folder of a state, which need not exist."""
+        """Return the folder of a state, which need not exist."""
         return self.folder / STATES / name
 
     def read(self, name: str) -> BackupState:
-        """The record of a state. Raises StoreError if there is no such state, IntegrityError if it is unreadable."""
+        """Return the record of a state.
+
+        Raises StoreError if there is no such state, IntegrityError if it is unreadable.
+        """
         if name not in self.states():
             raise StoreError(
                 f"there is no backup {name!r} here" if name else "there is no complete backup here",

@@ -29,7 +29,7 @@ _UNDER_WAY = "restoring"  # within the destination, which is no data folder unti
 
 @dataclass(frozen=True, slots=True)
 class RestoreReport:
-    """What was restored, and the result of its verification."""
+    """The restored data folder, and the result of its verification."""
 
     folder: Path
     name: str
@@ -39,7 +39,7 @@ class RestoreReport:
 
     @property
     def ok(self) -> bool:
-        """Whether everything is there and verifies."""
+        """True if every file is there and the evidence verifies."""
         return self.audit.ok and not self.lost
 
 
@@ -63,13 +63,13 @@ def restore(
         name: the state to restore; "" for the newest.
         actor: gives the name of the person who restores, for the record, or raises if that is somebody else's; called
             with the folder once it has the accounts.
-        progress: called with the number of bytes copied, then verified.
+        progress: a function that is called with the number of bytes copied, then verified.
         files: durable file operations.
 
     Raises:
         StoreError: the destination is not empty or cannot be written.
         IntegrityError: the database or the log of signatures was altered in the backup or in copying.
-        OrthocaptureError: what `actor` raises; nothing is left of the restoration.
+        OrthocaptureError: raised by `actor`; nothing is left of the restoration.
     """
     files = files or DurableFiles()
     source = BackupFolder(backup, files, RandomIds())

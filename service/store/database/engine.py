@@ -47,19 +47,19 @@ _MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alemb
 
 
 def database_path(data_dir: Path) -> Path:
-    """The path of a data folder's database."""
+    """Return the path of a data folder's database."""
     return data_dir / DATABASE_NAME
 
 
 def read_schema(connection: Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
-    """The schema of this database in the form of `fresh_schema`: (type, name) → (table, SQL)."""
+    """Return the schema of this database in the format of `fresh_schema`: (type, name) → (table, SQL)."""
     made = connection.execute(text("SELECT type, name, tbl_name, sql FROM sqlite_master"))
     return {(str(row.type), str(row.name)): (str(row.tbl_name), row.sql) for row in made}
 
 
 @cache
 def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
-    """The schema of a new database of this version: (type such as table or index, name) → (table, SQL)."""
+    """Return the schema of a new database of this version: (type such as table or index, name) → (table, SQL)."""
     engine = create_engine("sqlite://")
     try:
         with engine.begin() as connection:
@@ -102,13 +102,13 @@ class Database:
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
-        """A read transaction: one consistent snapshot. Raises StoreError."""
+        """Yield a read transaction: one consistent snapshot. Raises StoreError."""
         with _store_errors(self._path), self._engine.connect() as connection, connection.begin():
             yield connection
 
     @contextmanager
     def writing(self) -> Generator[Connection]:
-        """A write transaction: commits through `Files` at the end, rolls back on any exception.
+        """Yield a write transaction: commits through `Files` at the end, rolls back on any exception.
 
         What it changes is in the journal before it is committed. Nothing is committed, and so nothing is signed,
         unless what was recorded before is still there.
@@ -131,7 +131,7 @@ class Database:
                     self._commit(raw, transaction)
 
     def _watched(self, connection: Connection) -> sqlite3.Connection | None:
-        """The driver's connection, whose changes are noted; None without a journal, or before the tables are made."""
+        """Return the driver's connection, whose changes are noted; None without a journal or before tables exist."""
         raw = connection.connection.driver_connection
         assert isinstance(raw, sqlite3.Connection)  # the engine's own driver
         if self._journal is None:
@@ -183,9 +183,10 @@ class Database:
                 self._journal.require_not_cut(self._journal.tail(), held)
 
     def _require_record(self, *, signs: bool) -> int:
-        """The number of the journal's line that the database holds. Raises RecordDamagedError unless both agree.
+        """Return the number of the journal's line that the database holds.
 
-        Called with the write lock held. What is signed is looked at closely, and so is a write once a second.
+        Raises RecordDamagedError unless both agree. The caller holds the write lock. What is signed
+        is looked at closely, and so is a write once a second.
         """
         assert self._journal is not None
         held, tail = self._looked_up(closely=signs), self._journal.tail()
@@ -194,7 +195,7 @@ class Database:
         return held
 
     def _looked_up(self, *, closely: bool) -> int:
-        """The number of the journal's line that the database holds, as a new connection finds it.
+        """Return the number of the journal's line that the database holds, as a new connection finds it.
 
         This one reads pages of the file that other connections only remember, and each commit writes the number.
         Looked at closely, the last events that were written here must still be there, too. If the file itself has
@@ -234,7 +235,7 @@ class Database:
         return int(held)
 
     def _missing(self, fresh: sqlite3.Connection, *, changed: bool) -> list[str]:
-        """Chains whose last event is gone; if the file has `changed`, also those that have lost any other event.
+        """Return chains whose last event is gone; if the file has `changed`, also those that lost any other event.
 
         Raises sqlite3.DatabaseError if the changed file does not fit together, as an older one under a newer log.
         """

@@ -22,7 +22,7 @@ _HEAD_DAMAGED = -1
 
 
 def wal_findings(data_dir: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on commits that SQLite ignores. Raises StoreError if the log cannot be read.
+    """Return faults and notes on commits that SQLite ignores. Raises StoreError if the log cannot be read.
 
     One such commit may be the rest of a write cut off by a power failure, because frames need not reach the disk in
     order; it is a note. Two or more mean damage, because a commit begins only when the one before it is on disk.
@@ -40,7 +40,7 @@ def wal_findings(data_dir: Path) -> tuple[list[Fault], list[str]]:
 
 
 def _passed_over(log: Path) -> int:
-    """Number of commits after a damaged frame of a write-ahead log, or _HEAD_DAMAGED; 0 without a log."""
+    """Return the number of commits after a damaged frame of a write-ahead log, or _HEAD_DAMAGED; 0 without a log."""
     try:
         content = log.read_bytes()
     except FileNotFoundError:

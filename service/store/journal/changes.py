@@ -54,7 +54,7 @@ def forget(connection: sqlite3.Connection) -> None:
 
 
 def changed_rows(connection: sqlite3.Connection) -> list[RowImage]:
-    """The rows that the present transaction has changed, as they now are, in the order of their first change."""
+    """Return the rows that the present transaction has changed, as they are now, in order of their first change."""
     keys = ", ".join(f"k{index}" for index in range(_MOST_KEYS))
     asked = f"SELECT name, {keys} FROM {_TOUCHED} GROUP BY name, {keys} ORDER BY min(rowid)"
     images: list[RowImage] = []
@@ -70,7 +70,7 @@ def changed_rows(connection: sqlite3.Connection) -> list[RowImage]:
 
 
 def every_row(connection: sqlite3.Connection) -> Iterator[RowImage]:
-    """All rows that the journal keeps, events in the order in which they were written."""
+    """Yield all rows that the journal keeps, events in the order in which they were written."""
     for name in KEPT:
         columns = ", ".join(f"t.{column}" for column in _COLUMNS[name])
         order = _ORDER.get(name, ", ".join(_KEYS[name]))
@@ -83,18 +83,18 @@ def _image(name: str, row: Sequence[Value]) -> RowImage:
 
 
 def is_known(row: RowImage) -> bool:
-    """Whether the journal keeps this table, and the row has its key and no foreign column."""
+    """Return whether the journal keeps this table, and the row has its key and no foreign column."""
     columns = _COLUMNS.get(row.table, ())
     return set(_KEYS.get(row.table, ("",))) <= row.values.keys() <= set(columns)
 
 
 def key_of(row: RowImage) -> tuple[str, tuple[Value, ...]]:
-    """The table and the primary key of a row. Raises KeyError for a table that the journal does not keep."""
+    """Return the table and the primary key of a row. Raises KeyError for a table that the journal does not keep."""
     return row.table, tuple(row.values[column] for column in _KEYS[row.table])
 
 
 def row_of_key(table: str, key: Sequence[Value]) -> RowImage:
-    """A row of which only the key is known."""
+    """Return a row of which only the key is known."""
     return RowImage(table, dict(zip(_KEYS[table], key, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""Reads what a journal says on the whole, and compares it with its database: what either lacks or has otherwise."""
+"""Reads a whole journal and compares it with its database: what is missing from either or differs."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Survey:
         before_last: number of the line that the database held before the last line's transaction.
         void: numbers of the lines whose transaction was never committed, as the lines after them say.
         problems: (number, what is wrong) of each line that is not as it was written.
-        mark: what the end says of the last line; None if it says nothing.
-        torn_bytes: how many bytes at the end are no line, as after a power cut.
-        earlier_events: how many events were recorded before the journal was begun.
+        mark: the mark at the end, which says what became of the last line; None if there is none.
+        torn_bytes: number of bytes at the end that are no line, as after a power cut.
+        earlier_events: number of events that were recorded before the journal was started.
     """
 
     last: int
@@ -42,7 +42,7 @@ class Survey:
     earlier_events: int
 
     def is_behind(self, held: int) -> bool:
-        """Whether a database that holds line `held` lacks something that was committed."""
+        """Return whether something that was committed is missing from a database that holds line `held`."""
         committed = self.mark is not None and self.mark.word == "committed"
         return held < self.last and (held != self.before_last or committed)
 
@@ -133,7 +133,7 @@ def survey(path: Path) -> Survey:
 
 
 def committed_rows(path: Path, surveyed: Survey, until: int) -> Iterator[RowImage]:
-    """The rows of all committed lines up to number `until` that are as they were written, in their order."""
+    """Yield the rows of all committed lines up to number `until` that are as they were written, in their order."""
     left_out = surveyed.void | {number for number, _ in surveyed.problems}
     for item in read_lines(path):
         if isinstance(item, JournalLine) and 0 < item.number <= until and item.number not in left_out:
@@ -149,7 +149,7 @@ _Key = tuple[str, tuple[Value, ...]]
 def journal_findings(
     data_dir: Path, connection: Connection, run_ids: Sequence[str] | None, held_now: Callable[[], int]
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between a database and its journal.
+    """Return faults and notes on differences between a database and its journal.
 
     Args:
         data_dir: the data folder.
@@ -202,7 +202,7 @@ def _notes(surveyed: Survey, held: int) -> Iterator[str]:
 def _differences(
     connection: sqlite3.Connection, rows: Iterator[RowImage], wanted: set[str] | None
 ) -> Iterator[Fault]:
-    """Rows that the database lacks, has otherwise, or has beside the journal."""
+    """Yield a fault for each row that is missing from the database, differs in it, or is not in the journal."""
     expected: dict[_Key, _Written] = {}
     for row in rows:
         if not _is_of(row, wanted):
@@ -236,7 +236,7 @@ def _is_of(row: RowImage, wanted: set[str] | None) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """What must still be as it was written: these columns of a row, of which there may be many, as a digest."""
+    """The columns of a row that must still be as they were written, and a digest: there may be many rows."""
 
     columns: tuple[str, ...]  # an older line may have fewer than the table
     digest: bytes

@@ -50,12 +50,12 @@ class Tail:
 
     Attributes:
         place: device and inode of the file.
-        number: of the last line.
+        number: the last line's number.
         after: number of the line that the database held before the last line's transaction.
-        sha256: of the last line.
-        start: its offset in the file.
+        sha256: the last line's hash.
+        start: the last line's offset in the file.
         end: the offset after it.
-        word: what its mark says; None if it has none.
+        word: the word of its mark; None if it has none.
     """
 
     place: tuple[int, int]
@@ -76,7 +76,7 @@ class Journal:
         self._known: Tail | None = None
 
     def tail(self) -> Tail | None:
-        """The end of the journal; None if there is no line yet.
+        """Return the end of the journal; None if there is no line yet.
 
         Raises:
             RecordDamagedError: the file is not the one that this process has read or written before.
@@ -105,7 +105,7 @@ class Journal:
         return found
 
     def require_not_cut(self, tail: Tail | None, held: int) -> None:
-        """Raise RecordDamagedError if the journal lacks a line of the database; `tail` was read after `held`."""
+        """Raise RecordDamagedError if the journal misses a line of the database; `tail` was read after `held`."""
         if tail is None and held:
             raise RecordDamagedError(
                 f"{NAME} is missing or empty, and the database holds its line {held}: the journal was removed or cut",
@@ -121,7 +121,7 @@ class Journal:
             )
 
     def require_not_behind(self, tail: Tail | None, held: int) -> None:
-        """Raise RecordDamagedError if the database lacks a committed line; `tail` was read before `held`."""
+        """Raise RecordDamagedError if the database misses a committed line; `tail` was read before `held`."""
         if tail is None or held >= tail.number or (held == tail.after and tail.word != "committed"):
             return
         raise RecordDamagedError(
@@ -135,7 +135,7 @@ class Journal:
         """Append the changes of a transaction durably, before it is committed. Raises OSError, StoreError.
 
         Args:
-            rows: what the transaction leaves behind.
+            rows: the rows as the transaction leaves them.
             held: number of the line that the database holds, as it was compared with the tail.
         """
         tail = self._known
@@ -173,8 +173,8 @@ class Journal:
     def mark(self, tail: Tail, word: Word) -> None:
         """Say what became of the last line's transaction, unless another line follows already.
 
-        The mark is not synced: it helps to tell an interrupted commit from a database that was replaced. Without it,
-        the database alone decides.
+        The mark is not synced: it helps to distinguish an interrupted commit from a database that was replaced.
+        Without it, the database alone decides.
         """
         raw = mark_bytes(Mark(word, tail.number, tail.sha256))
         with suppress(OSError), _locked(self.path) as descriptor:
@@ -184,7 +184,7 @@ class Journal:
 
 
 def _beginning(rows: Iterable[RowImage], earlier_events: int, last: list[Tail]) -> Iterator[bytes]:
-    """The lines of a beginning; the tail that they make is put into `last`, but for its place."""
+    """Yield the lines of a beginning; the tail that they make is put into `last`, but for its place."""
     previous, end = FIRST, 0
     for number, (block, following) in enumerate(pairwise(chain(_blocks(rows), (None,))), start=1):
         earlier = earlier_events if number == 1 else 0
@@ -217,7 +217,7 @@ def _locked(path: Path) -> Generator[int]:
 
 
 def read_tail(path: Path) -> Tail | None:
-    """The end of any journal, such as a copy; None if the file has no line or does not exist.
+    """Return the end of any journal, such as a copy; None if the file has no line or does not exist.
 
     Raises RecordDamagedError if a line near the end does not follow the one before it, OSError.
     """
@@ -230,7 +230,7 @@ def read_tail(path: Path) -> Tail | None:
 
 
 def _last(descriptor: int, size: int, place: tuple[int, int]) -> Tail | None:
-    """The tail of a file that was not read before, from its end; None if it has no line."""
+    """Return the tail of a file that was not read before, from its end; None if it has no line."""
     length = _BLOCK_BYTES
     while True:
         begin = max(0, size - length)
@@ -252,7 +252,7 @@ def _tail_in(content: bytes, offset: int, place: tuple[int, int]) -> Tail | None
 
 
 def _following(descriptor: int, known: Tail) -> Tail | None:
-    """The tail of a file that has grown since; None if the last line that is known is not there any more."""
+    """Return the tail of a file that has grown since; None if the last line that is known is not there any more."""
     content = os.pread(descriptor, max(0, os.fstat(descriptor).st_size - known.start), known.start)
     lines = _split(content)
     if not lines or hashlib.sha256(lines[0]).hexdigest() != known.sha256:
@@ -266,14 +266,14 @@ def _following(descriptor: int, known: Tail) -> Tail | None:
 
 
 def _split(content: bytes) -> list[bytes]:
-    """The pieces of the file, each up to and with its line end."""
+    """Return the pieces of the file, each up to and with its line end."""
     *whole, rest = content.split(b"\n")
     pieces = [piece + b"\n" for piece in whole]
     return [*pieces, rest] if rest else pieces
 
 
 def _next(found: Tail | None, raw: bytes, offset: int, place: tuple[int, int]) -> Tail | None:
-    """The tail with one more piece of the file: a mark, a line, or what a power cut left, which does not count."""
+    """Return the tail with one more piece of the file: a mark, a line, or what a power cut left, which is void."""
     mark = parse_mark(raw)
     if mark is not None:
         fits = found is not None and (mark.number, mark.sha256) == (found.number, found.sha256)

@@ -37,18 +37,18 @@ class RowImage:
 
 @dataclass(frozen=True, slots=True)
 class JournalLine:
-    """One line.
+    """One line of the journal.
 
     Attributes:
-        number: from 1, as it says; 0 if it cannot be read.
+        number: the line's number from 1, as it says; 0 if it cannot be read.
         after: number of the line that the database held when this one was written; 0 for none.
-        previous_sha256: of the line before it, as it says.
-        rows: what its transaction changed.
-        continued: whether the next line belongs to the same transaction.
-        earlier_events: of a journal's first line: how many events were recorded before there was a journal.
-        sha256: of its bytes.
-        end: offset in the file after it.
-        problem: why it is not as it was written, as far as it shows by itself; "" if it does not.
+        previous_sha256: hash of the line before it, as it says.
+        rows: the rows that its transaction changed.
+        continued: true if the next line belongs to the same transaction.
+        earlier_events: number of events that were recorded before there was a journal; only in its first line.
+        sha256: hash of its bytes.
+        end: the offset in the file after it.
+        problem: the reason why it is not as it was written, as far as it shows by itself; "" if it does not.
     """
 
     number: int
@@ -64,16 +64,16 @@ class JournalLine:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What became of the last line's transaction."""
+    """The mark behind the last line, which says what became of its transaction."""
 
     word: Word
     number: int
-    sha256: str  # of the line
+    sha256: str  # hash of the line
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """What follows the last line: a mark, nothing, or bytes that are neither, as a power cut may leave."""
+    """The end after the last line: a mark, nothing, or bytes that are neither, as a power cut may leave."""
 
     mark: Mark | None
     torn_bytes: int
@@ -81,7 +81,7 @@ class Ending:
 
 @dataclass(frozen=True, slots=True)
 class LineFields:
-    """What a line says beside its rows."""
+    """The fields of a line besides its rows."""
 
     number: int
     after: int
@@ -91,7 +91,7 @@ class LineFields:
 
 
 def line_bytes(fields: LineFields, rows: Sequence[RowImage]) -> bytes:
-    """The bytes of a line."""
+    """Return the bytes of a line."""
     data: dict[str, Any] = {
         "number": fields.number,
         "after": fields.after,
@@ -106,12 +106,12 @@ def line_bytes(fields: LineFields, rows: Sequence[RowImage]) -> bytes:
 
 
 def mark_bytes(mark: Mark) -> bytes:
-    """The bytes of a mark."""
+    """Return the bytes of a mark."""
     return _JSON.encode({"mark": mark.word, "number": mark.number, "sha256": mark.sha256}).encode() + b"\n"
 
 
 def parse_line(raw: bytes, end: int) -> JournalLine:
-    """A line from its bytes, which end at this offset of the file, with what is wrong with it."""
+    """Return a line from its bytes, which end at this offset of the file, with what is wrong with it."""
     sha256 = hashlib.sha256(raw).hexdigest()
     try:
         data: Any = json.loads(raw)
@@ -140,7 +140,7 @@ def _row(item: Any) -> RowImage:
 
 
 def parse_mark(raw: bytes) -> Mark | None:
-    """A mark from its bytes; None if these are not exactly those of a mark."""
+    """Return a mark from its bytes; None if these are not exactly those of a mark."""
     try:
         data: Any = json.loads(raw)
         mark = Mark(data["mark"], int(data["number"]), str(data["sha256"]))
@@ -150,7 +150,7 @@ def parse_mark(raw: bytes) -> Mark | None:
 
 
 def read_lines(path: Path) -> Iterator[JournalLine | Ending]:
-    """Every line in order, then the ending; nothing for a file that does not exist. Raises StoreError.
+    """Yield every line in order, then the ending; nothing for a file that does not exist. Raises StoreError.
 
     An unreadable line with others after it is a line with a problem; at the end of the file it belongs to the ending.
     """
@@ -165,7 +165,7 @@ def read_lines(path: Path) -> Iterator[JournalLine | Ending]:
 
 def _lines(stream: Iterable[bytes]) -> Iterator[JournalLine | Ending]:
     end, last = 0, (0, FIRST)
-    waiting: list[tuple[bytes, int]] = []  # what may be the ending: a mark, or what a power cut left
+    waiting: list[tuple[bytes, int]] = []  # lines that may be the ending: a mark, or what a power cut left
     for raw in stream:
         end += len(raw)
         line = parse_line(raw, end)
@@ -183,13 +183,13 @@ def _lines(stream: Iterable[bytes]) -> Iterator[JournalLine | Ending]:
 
 
 def first_lines(path: Path, number: int) -> Iterator[bytes]:
-    """The bytes of the first `number` lines, as they are, without a mark. Raises OSError."""
+    """Yield the bytes of the first `number` lines, as they are, without a mark. Raises OSError."""
     with path.open("rb") as stream:
         yield from islice((raw for raw in stream if parse_mark(raw) is None), number)
 
 
 def unreadable(path: Path, error: OSError) -> StoreError:
-    """The error for a journal that cannot be read."""
+    """Return the error for a journal that cannot be read."""
     return StoreError(
         f"the journal cannot be read: {error.strerror or error}",
         where=str(path),

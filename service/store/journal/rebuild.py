@@ -1,4 +1,4 @@
-"""Make a database again from its journal, or a journal from its database; what was there before is kept beside it."""
+"""Make a database again from its journal, or a journal from its database; what was there before stays beside it."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ _MOST_NAMED = 20
 
 @dataclass(frozen=True, slots=True)
 class RebuildReport:
-    """What was done.
+    """The result of a rebuild.
 
     Attributes:
-        made: what was made again; "" if database and journal agree.
-        why: what was found.
-        events: in all chains afterwards.
-        restored_events: of these, which the old database did not hold any more.
+        made: the part that was made again; "" if database and journal agree.
+        why: the fault that was found.
+        events: number of events in all chains afterwards.
+        restored_events: number of these that the old database no longer held.
         kept: files of the data folder that hold what was there before.
-        lost: what could not be restored, in words.
-        unsigned: why the record of this could not be signed; "" if it was.
+        lost: texts on what could not be restored.
+        unsigned: the reason why the record of this could not be signed; "" if it was.
     """
 
     made: Literal["", "database", "journal"]
@@ -60,9 +60,9 @@ class _Found:
     """A database as it was found.
 
     Attributes:
-        problem: why it cannot be relied upon; "" if SQLite reads all of it.
+        problem: the reason why it cannot be relied upon; "" if SQLite reads all of it.
         held: number of the journal's line that it holds.
-        events: how many events can be read.
+        events: number of events that can be read.
     """
 
     problem: str
@@ -80,22 +80,22 @@ def rebuild(
 ) -> RebuildReport:
     """Make again what does not agree with the other: the database from the journal, or the journal from the database.
 
-    The journal counts, if its lines are as they were written and the database lacks one of them, has another row or
-    cannot be read; the database counts if all of it can be read and the journal lacks what it holds. This is recorded
-    in the site's chain, and signed. No process may use the data folder meanwhile; one that does is refused its next
-    write.
+    The journal counts if its lines are as they were written and the database misses one of them, has another row or
+    cannot be read; the database counts if all of it can be read and the journal misses what it holds. This is
+    recorded in the site's chain, and signed. No process may use the data folder meanwhile; one that does is refused
+    its next write.
 
     Args:
         data_dir: the data folder.
         actor: gives the name of the person for the record, or raises if that is somebody else's; called with a folder
             that has the accounts.
-        journal: a copy of the journal kept elsewhere, from which the database is made in any case.
+        journal: a copy of the journal from elsewhere, from which the database is made in any case.
         files: durable file operations.
-        clock: gives the time for the names of what is kept.
+        clock: gives the time for the names of the files that stay.
 
     Raises:
         StoreError: there is nothing to rebuild from, or the folder cannot be written; nothing was changed.
-        OrthocaptureError: what `actor` raises; nothing was changed.
+        OrthocaptureError: raised by `actor`; nothing was changed.
     """
     files, clock = files or DurableFiles(), clock or SystemClock()
     stamp = utc_text(clock.utc_now()).replace(":", "").replace("-", "")
@@ -132,7 +132,7 @@ def _look(data_dir: Path) -> _Found:
 
 
 def _why(data_dir: Path, surveyed: Survey, found: _Found) -> str:
-    """What the database lacks, or has otherwise than its journal; "" if they agree."""
+    """Return how the database differs from its journal; "" if they agree."""
     if surveyed.is_behind(found.held):
         return f"the database held line {found.held} of the journal, which has {surveyed.last}"
     database = open_read_only(data_dir, DurableFiles())
@@ -153,7 +153,7 @@ def _journal_again(
     files: Files,
     clock: Clock,
 ) -> RebuildReport:
-    """Begin the journal anew with what the database holds."""
+    """Start the journal again with what the database holds."""
     why = (
         f"line {surveyed.problems[0][0]} of the journal: {surveyed.problems[0][1]}"
         if surveyed.problems
@@ -179,7 +179,7 @@ def _journal_again(
 
 
 def _named_with_a_copy(data_dir: Path, actor: Callable[[Path], str], files: Files) -> str:
-    """The person's name, by the accounts in a copy of the database: the folder itself does not open as it is."""
+    """Return the person's name, by the accounts in a copy of the database: the folder itself does not open."""
     with _work_folder(data_dir, files) as work:
         with (
             closing(sqlite3.connect(database_path(data_dir))) as original,
@@ -192,7 +192,7 @@ def _named_with_a_copy(data_dir: Path, actor: Callable[[Path], str], files: File
 
 @contextmanager
 def _work_folder(data_dir: Path, files: Files) -> Generator[Path]:
-    """A folder within the data folder that has its keys, and is gone afterwards."""
+    """Yield a folder within the data folder that has its keys, and is gone afterwards."""
     work = data_dir / _WORK
     shutil.rmtree(work, ignore_errors=True)  # of an interrupted rebuild
     files.make_directory(work, private=True)

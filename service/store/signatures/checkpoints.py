@@ -31,19 +31,19 @@ _COLUMNS = tuple(field.name for field in fields(Checkpoint))
 
 
 def statement(checkpoint: Checkpoint) -> bytes:
-    """The bytes that are signed: RFC 8785 canonical JSON of every field except the signature, with the purpose."""
+    """Return the bytes that are signed: RFC 8785 canonical JSON of all fields but the signature, with the purpose."""
     named = asdict(checkpoint)
     del named["signature"]
     return canonical(named | {"purpose": PURPOSE}).encode()
 
 
 def key_fingerprint(public_key: bytes) -> str:
-    """SHA-256 (hexadecimal) of the 32 raw bytes of an Ed25519 public key, which people write down and compare."""
+    """Return the SHA-256 (hexadecimal) of the 32 raw bytes of an Ed25519 public key, for people to compare."""
     return hashlib.sha256(public_key).hexdigest()
 
 
 def signed_by(checkpoint: Checkpoint, public_key: bytes) -> bool:
-    """Whether this key (32 raw bytes) made the checkpoint's signature."""
+    """Return whether this key (32 raw bytes) made the checkpoint's signature."""
     try:
         signature = base64.b64decode(checkpoint.signature, validate=True)
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, statement(checkpoint))
@@ -63,12 +63,12 @@ class RowsDigest:
         self._hash.update(record_sha256.encode() + b"\n")
 
     def hexdigest(self) -> str:
-        """The digest over the rows added so far."""
+        """Return the digest over the rows added so far."""
         return self._hash.hexdigest()
 
 
 def artefacts_digest(connection: Connection, run_id: str) -> str:
-    """The RowsDigest over all artefact rows of a run, in hexadecimal."""
+    """Return the RowsDigest over all artefact rows of a run, in hexadecimal."""
     digest = RowsDigest()
     ordered = select(artefacts.c.record_sha256).where(artefacts.c.run_id == run_id)
     for record_sha256 in connection.execute(ordered.order_by(artefacts.c.seq, artefacts.c.position)).scalars():
@@ -82,44 +82,47 @@ def insert_checkpoint(connection: Connection, checkpoint: Checkpoint) -> None:
 
 
 def last_checkpoint(connection: Connection, run_id: str) -> Checkpoint | None:
-    """The newest checkpoint of a run, or None."""
+    """Return the newest checkpoint of a run, or None."""
     newest = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq.desc()).limit(1)
     row = connection.execute(newest).one_or_none()
     return None if row is None else to_checkpoint(row)
 
 
 def read_checkpoints(connection: Connection, run_id: str) -> list[Checkpoint]:
-    """All checkpoints of a run, oldest first."""
+    """Return all checkpoints of a run, oldest first."""
     found = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq)
     return [to_checkpoint(row) for row in connection.execute(found)]
 
 
 def read_checkpoint(connection: Connection, run_id: str, seq: int) -> Checkpoint | None:
-    """The checkpoint of one event, or None."""
+    """Return the checkpoint of one event, or None."""
     found = select(checkpoints).where(checkpoints.c.run_id == run_id, checkpoints.c.seq == seq)
     row = connection.execute(found).one_or_none()
     return None if row is None else to_checkpoint(row)
 
 
 def read_every_checkpoint(connection: Connection) -> list[Checkpoint]:
-    """The checkpoints of all chains, in the order in which they were made."""
+    """Return the checkpoints of all chains, in the order in which they were made."""
     made = select(checkpoints).order_by(checkpoints.c.site_seq, checkpoints.c.run_id == SITE, checkpoints.c.seq)
     return [to_checkpoint(row) for row in connection.execute(made)]
 
 
 def read_timestamps(connection: Connection, run_id: str) -> list[Timestamp]:
-    """All time stamps on a run's checkpoints, oldest first."""
+    """Return all time stamps on a run's checkpoints, oldest first."""
     found = select(timestamps).where(timestamps.c.run_id == run_id).order_by(timestamps.c.seq, timestamps.c.authority)
     return [Timestamp(row.run_id, row.seq, row.authority, row.at_utc, row.token) for row in connection.execute(found)]
 
 
 def to_checkpoint(row: Row[Any]) -> Checkpoint:
-    """A row of the table as a Checkpoint."""
+    """Return a row of the table as a Checkpoint."""
     return Checkpoint(**{name: getattr(row, name) for name in _COLUMNS})
 
 
 def read_key_changes(connection: Connection) -> list[tuple[int, dict[str, Any]]]:
-    """(seq, payload as plain data) of every KeyChanged in the site's chain, oldest first. Raises ValueError."""
+    """Return (seq, payload as plain data) of every KeyChanged in the site's chain, oldest first.
+
+    Raises ValueError.
+    """
     found = select(events.c.seq, events.c.payload).where(events.c.run_id == SITE, events.c.kind == "key_changed")
     return [(row.seq, parse_canonical(row.payload)) for row in connection.execute(found.order_by(events.c.seq))]
 
@@ -129,7 +132,7 @@ _REMEDY = "Restore the folder keys/ from a copy, or make a new key with `orthoca
 
 
 def public_bytes(key: Ed25519PrivateKey) -> bytes:
-    """The 32 raw bytes of the public key (RFC 8032)."""
+    """Return the 32 raw bytes of the public key (RFC 8032)."""
     return key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
 
 
@@ -165,7 +168,7 @@ class KeyFolder:
         return key
 
     def load(self, key_id: str) -> Ed25519PrivateKey:
-        """The private key with this fingerprint.
+        """Return the private key with this fingerprint.
 
         Raises SigningKeyError if the file is missing, damaged, readable by others or holds another key.
         """
@@ -196,7 +199,7 @@ class KeyFolder:
         return key
 
     def present(self) -> list[str]:
-        """Fingerprints of the complete key files, sorted."""
+        """Return fingerprints of the complete key files, sorted."""
         return sorted(path.stem for path in self._folder.glob(f"*{_SUFFIX}")) if self._folder.is_dir() else []
 
     def destroy_all_but(self, key_id: str) -> None:

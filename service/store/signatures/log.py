@@ -2,7 +2,7 @@
 
 If the database is rewritten, cut or replaced, the log holds signatures that no longer fit it. Each line is signed and
 holds the hash of the line before it, so that lines cannot be removed, changed or swapped. A cut at the end is found
-with a copy kept elsewhere (service.store.signatures.second_place).
+with a copy elsewhere (service.store.signatures.second_place).
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class LogLine:
     """One line of the log: a checkpoint, and a signature that binds it to the line before.
 
     Attributes:
-        number: from 1.
-        checkpoint: None if the line cannot be read.
-        problem: why the line cannot be read or does not follow the line before it; "" if it is valid.
+        number: the line's number, from 1.
+        checkpoint: the checkpoint in the line; None if the line cannot be read.
+        problem: the reason why the line cannot be read or does not follow the one before it; "" if it is valid.
         message: the bytes that are signed.
         key_id: fingerprint of the key that signed the line.
-        signature: base64.
+        signature: the signature in base64.
     """
 
     number: int
@@ -64,7 +64,7 @@ class LogLine:
     signature: str = ""
 
     def signed_by(self, public_key: bytes) -> bool:
-        """Whether this key (32 raw bytes) made the line's signature."""
+        """Return whether this key (32 raw bytes) made the line's signature."""
         try:
             signature = base64.b64decode(self.signature, validate=True)
             if base64.b64encode(signature).decode() != self.signature:  # the last character has unused bits
@@ -80,7 +80,7 @@ class LogEnd:
     """A place in the log where a line ends: the beginning of the log, or how far it was read."""
 
     offset: int = 0  # bytes before it
-    number: int = 0  # of the last line before it
+    number: int = 0  # number of the last line before it
     last_bytes: int = 0  # length of that line
     previous: str = _FIRST  # SHA-256 of that line
 
@@ -135,7 +135,7 @@ class SignatureLog:
             raise _unwritten(self.path, error) from error
 
     def lines_after(self, end: LogEnd) -> tuple[list[LogLine], LogEnd] | None:
-        """The lines after a place, and where the last of them ends.
+        """Return the lines after a place, and where the last of them ends.
 
         None if there is no log, or the line before that place is no longer there. Raises StoreError if it cannot be
         read.
@@ -171,7 +171,7 @@ class SignatureLog:
 
 
 def power_cut_explains(missing: Sequence[Checkpoint], newest: int) -> bool:
-    """Whether one interrupted signature explains that these checkpoints have no line.
+    """Return whether one interrupted signature explains that these checkpoints have no line.
 
     The next signature writes the lines that are missing before anything else, so that no more than those of one
     signature can be. `newest` is the greatest `site_seq` that has a line.
@@ -183,8 +183,8 @@ def power_cut_explains(missing: Sequence[Checkpoint], newest: int) -> bool:
 def copying_alone(log: Path) -> Generator[None]:
     """Wait until no other process writes to the second place of this log, and keep them waiting.
 
-    Signatures do not wait for it: they are kept apart by the folder (SignatureLog.alone). Before the first signature
-    there is nothing to wait for. Raises StoreError if the log cannot be read.
+    Signatures do not wait for it: a lock of the folder serialises them (SignatureLog.alone). Before the first
+    signature there is nothing to wait for. Raises StoreError if the log cannot be read.
     """
     try:
         descriptor = os.open(log, os.O_RDONLY | os.O_CLOEXEC)
@@ -201,7 +201,7 @@ def copying_alone(log: Path) -> Generator[None]:
 
 
 def unreadable(path: Path, error: OSError) -> StoreError:
-    """The error of a log of signatures, or of a copy of it, that cannot be read."""
+    """Return the error of a log of signatures, or of a copy of it, that cannot be read."""
     return StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK)
 
 
@@ -214,13 +214,13 @@ def _unwritten(path: Path, error: OSError) -> StoreError:
 
 
 def read_log(path: Path) -> list[LogLine] | None:
-    """The lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
+    """Return the lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
     content = _content(path, 0)
     return None if content is None else [line for line, _ in _parsed(content, LogEnd())]
 
 
 def _content(path: Path, offset: int) -> bytes | None:
-    """The log from an offset on; None if the file does not exist. Raises StoreError."""
+    """Return the log from an offset on; None if the file does not exist. Raises StoreError."""
     try:
         with path.open("rb") as stream:
             stream.seek(offset)
@@ -232,7 +232,7 @@ def _content(path: Path, offset: int) -> bytes | None:
 
 
 def _parsed(content: bytes, end: LogEnd) -> Iterator[tuple[LogLine, LogEnd]]:
-    """The lines that follow a place, each with its own end."""
+    """Yield the lines that follow a place, each with its own end."""
     # A line without a line end was cut off by a power failure and was never reported as written.
     whole = content[: content.rfind(b"\n") + 1]
     for raw in whole.splitlines(keepends=True):
@@ -280,13 +280,13 @@ def log_findings(
     *,
     awaited: bool,
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between the log and the checkpoints of a database.
+    """Return faults and notes on differences between the log and the checkpoints of a database.
 
     Args:
         lines: the log's lines, oldest first; None if there is no log.
         present: the database's checkpoints by run; lines for other runs are not compared.
         public_keys: raw public keys by fingerprint.
-        awaited: whether there must be a log, because something was signed here.
+        awaited: true if there must be a log, because something was signed here.
     """
     if lines is None:
         missing = Fault(None, None, NAME, "the log of signatures is missing: it was removed")
@@ -318,12 +318,12 @@ def log_findings(
 def written_again_findings(
     said: Sequence[tuple[int, SignaturesWrittenAgain]], run_id: str | None
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on lines that were missing and were written again.
+    """Return faults and notes on lines that were missing and were written again.
 
     What an interrupted signature does not explain stays a fault of the runs whose signatures these were.
 
     Args:
-        said: what the site's chain says of them, with the numbers of its events.
+        said: the payloads of the site's chain that report them, with the numbers of their events.
         run_id: the run that is verified; None for all.
     """
     faults: list[Fault] = []
@@ -366,10 +366,10 @@ class SeenSignatures:
     not, everything is read again.
 
     Attributes:
-        there: whether there is a log.
-        end: where the log ends, as far as it was read.
+        there: true if there is a log.
+        end: the end of the log, as far as it was read.
         missing: checkpoints without a line, oldest first.
-        explained: whether an interrupted signature explains the missing lines.
+        explained: true if an interrupted signature explains the missing lines.
         key_id: fingerprint of the key in use; "" before the first signature.
     """
 
@@ -408,11 +408,11 @@ class SeenSignatures:
             self.key_id, self._keys_until = self.key_in_use(connection), connection.execute(_HEAD).scalar() or 0
 
     def made_since(self, connection: Connection) -> list[Checkpoint]:
-        """The checkpoints that were made since the last look, oldest first."""
+        """Return the checkpoints that were made since the last look, oldest first."""
         return [to_checkpoint(row) for row in connection.execute(_NEW.where(self._last[0] < _ROWID))]
 
     def fault(self, run_id: str) -> Fault | None:
-        """What forbids to sign this chain: its signatures, or the log; None if nothing does."""
+        """Return the fault of signatures or log that forbids signing this chain; None if there is none."""
         if not self.there and self.key_id:
             return Fault(None, None, NAME, "the log of signatures is missing: it was removed")
         return self._of_run.get(run_id) or self._of_log
@@ -449,7 +449,7 @@ class SeenSignatures:
         self.missing = tuple(awaited.values())
 
     def key_in_use(self, connection: Connection) -> str:
-        """Fingerprint of the key in use; "" before the first signature."""
+        """Return the fingerprint of the key in use; "" before the first signature."""
         found = self.key_id
         for row in connection.execute(_KEYS.where(events.c.seq > self._keys_until).order_by(events.c.seq)):
             try:

@@ -1,7 +1,7 @@
 """The second place of signatures: copies of log and journal that a thread keeps elsewhere, as on a share.
 
 A place can be away: the folder cannot be reached, is full or read-only, or hangs as a share does whose server is
-gone. That is told and tried again, and stops nothing.
+gone. That is reported and tried again, and stops nothing.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PATIENCE_S = 3.0  # a share that answers needs milliseconds
 
 @dataclass(frozen=True, slots=True)
 class Away:
-    """Since when the second place is not up to date, and why."""
+    """The time since when the second place is not up to date, and the reason."""
 
     place: Path
     since_utc: str
@@ -36,7 +36,7 @@ class Away:
 
 
 class KeptCopy(Protocol):
-    """A copy that is kept in the second place."""
+    """A copy that is stored in the second place."""
 
     @property
     def copy(self) -> Path:
@@ -49,7 +49,7 @@ class KeptCopy(Protocol):
 
 
 class SecondPlace:
-    """The copies of one data folder. Without `copies`, none is kept, and nothing is ever away."""
+    """The copies of one data folder. Without `copies`, none is made, and nothing is ever away."""
 
     def __init__(self, copies: Sequence[KeptCopy], clock: Clock, *, patience_s: float = _PATIENCE_S) -> None:
         self._copies = tuple(copies)
@@ -64,7 +64,7 @@ class SecondPlace:
     def of(
         cls, data_dir: Path, copy: Path | None, clock: Clock, files: Files, *, patience_s: float = _PATIENCE_S
     ) -> Self:
-        """That of a data folder whose log of signatures is copied to `copy`, and its journal to a file beside it.
+        """Return the second place of a folder whose log of signatures is copied to `copy`, and its journal beside it.
 
         `copy` is None if it has no second place.
         """
@@ -75,7 +75,7 @@ class SecondPlace:
 
     @property
     def away(self) -> Away | None:
-        """Since when the place is away; None if it is up to date, as far as is known."""
+        """The time since when the place is away, and why; None if it is up to date, as far as is known."""
         return self._away
 
     def update(self) -> Away | None:
@@ -115,7 +115,7 @@ class SecondPlace:
         done.set()
 
     def _written(self) -> tuple[Path, str] | None:
-        """Bring every copy up to date; else which one failed, and why."""
+        """Bring every copy up to date; return the one that failed and why, None if none did."""
         for one in self._copies:
             try:
                 one.bring_up_to_date()
@@ -131,7 +131,7 @@ class SecondPlace:
 
 
 def away_words(away: Away) -> str:
-    """What is told of a second place that is away."""
+    """Return the message about a second place that is away."""
     since = time_here(away.since_utc)
     return (
         f"the second place of the signatures, {away.place}, has not been up to date since {since}: {away.why}. "
@@ -156,7 +156,7 @@ class LogCopy:
         self._last = b""  # the last of these lines
 
     def bring_up_to_date(self) -> None:
-        """Append to the copy the lines that it lacks. A copy with other content is left as it is.
+        """Append to the copy the lines that are missing from it. A copy with other content is left as it is.
 
         Raises:
             IntegrityError: the copy is not a beginning of the source: one of them was changed.
@@ -198,7 +198,7 @@ class LogCopy:
 
 
 def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between the log and its copy, and between the journal and the copy beside it.
+    """Return faults and notes on differences between the log, or the journal, and its copy.
 
     Raises:
         StoreError: the copy is missing or cannot be read.
@@ -240,7 +240,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def journal_copy(signature_copy: Path) -> Path:
-    """The path of the copy of the journal, from that of the copy of the log of signatures."""
+    """Return the path of the copy of the journal, from that of the copy of the log of signatures."""
     return signature_copy.with_name(f"{signature_copy.stem}.{JOURNAL_NAME}")
 
 
@@ -253,7 +253,7 @@ class JournalCopy:
         self._files = files
 
     def bring_up_to_date(self) -> None:
-        """Append to the copy the lines that it lacks, once something was signed.
+        """Append to the copy the lines that are missing from it, once something was signed.
 
         Only its owner can read it, as it holds what the database holds. One process writes to it at a time: the lock
         is that of the log of signatures, as for its copy, because the journal's own would keep its writers waiting.
@@ -299,7 +299,7 @@ class JournalCopy:
 
 
 def journal_copy_faults(data_dir: Path, copy: Path) -> Iterator[Fault]:
-    """Faults of the journal that its copy shows; none if there is no copy. Raises StoreError.
+    """Yield faults of the journal that its copy shows; none if there is no copy. Raises StoreError.
 
     Each line holds the hash of the one before it, so the copy's last line stands for all of them.
     """
@@ -324,7 +324,7 @@ def journal_copy_faults(data_dir: Path, copy: Path) -> Iterator[Fault]:
 
 
 def _has(journal: Path, line: Tail) -> bool:
-    """Whether a journal has this line at the same place."""
+    """Return whether a journal has this line at the same place."""
     with journal.open("rb") as stream:
         stream.seek(line.start)
         return hashlib.sha256(stream.read(line.end - line.start)).hexdigest() == line.sha256

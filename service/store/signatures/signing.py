@@ -38,10 +38,10 @@ class PublicKey:
 
     key_id: str
     public_key: bytes
-    seq: int  # of its KeyChanged event
+    seq: int  # number of its KeyChanged event
     replaced_seq: int | None  # seq of its successor's KeyChanged; None for the key in use
     reason: str
-    introduced: bool  # whether its predecessor signed its KeyChanged; never for the first key
+    introduced: bool  # true if its predecessor signed its KeyChanged; never for the first key
 
 
 def checkpoint(store: Store, run_id: str) -> Checkpoint:
@@ -89,7 +89,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
 
     Args:
         store: the data folder.
-        reason: why, for the record.
+        reason: the reason of the person, for the record.
         actor: the person who replaces it.
         lost: the old private key is gone. The new one is recorded without its predecessor's signature, and every
             later verification says so.
@@ -128,7 +128,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
 
 
 def sign(store: Store, message: bytes) -> tuple[str, str]:
-    """Fingerprint of the key in use, and its signature over a message in base64. Raises SigningKeyError.
+    """Return the fingerprint of the key in use, and its signature over a message in base64. Raises SigningKeyError.
 
     The message must begin with its purpose, so that the signature cannot be used for anything else.
     """
@@ -138,7 +138,7 @@ def sign(store: Store, message: bytes) -> tuple[str, str]:
 
 
 def public_keys(store: Store) -> list[PublicKey]:
-    """Every key that has signed in this data folder, oldest first; the last one is in use."""
+    """Return every key that has signed in this data folder, oldest first; the last one is in use."""
     with store.database.reading() as connection:
         changes = read_key_changes(connection)
         signed = {item.seq: item for item in read_checkpoints(connection, SITE)}
@@ -163,7 +163,7 @@ def _look(store: Store, run_id: str) -> Checkpoint | None:
 
 
 def _write_missing_lines(store: Store) -> None:
-    """Write the lines that the log lacks, before anything new is signed; the site's chain says how many they are.
+    """Write the lines that the log misses before anything new is signed; the site's chain says how many they are.
 
     An interrupted signature leaves lines missing, and so does somebody who cuts the log. Raises StoreError.
     """
@@ -218,7 +218,7 @@ def _require_lost(connection: Connection, folder: KeyFolder) -> None:
 
 
 def _present_key(store: Store, connection: Connection) -> Ed25519PrivateKey:
-    """The key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
+    """Return the key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
     folder = KeyFolder(store.database_path.parent, store.files)
     key_id = store.seen_signatures.key_in_use(connection)
     if key_id:
@@ -247,7 +247,7 @@ def _record_key(
 
 
 def _signed_end(connection: Connection, run_id: str) -> Checkpoint | None:
-    """The checkpoint of a chain's last event; None if that event is not signed."""
+    """Return the checkpoint of a chain's last event; None if that event is not signed."""
     last = last_checkpoint(connection, run_id)
     return last if last is not None and (last.seq, last.sha256) == read_head(connection, run_id) else None
 

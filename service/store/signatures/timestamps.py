@@ -52,7 +52,7 @@ class Authority:
 
 
 def stamped_bytes(checkpoint: Checkpoint) -> bytes:
-    """The bytes to be stamped: the signed statement and its signature."""
+    """Return the bytes to be stamped: the signed statement and its signature."""
     return statement(checkpoint) + b"\n" + checkpoint.signature.encode()
 
 
@@ -75,7 +75,7 @@ def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timesta
 
 
 def _request(message: bytes, authority: Authority) -> bytes:
-    """The authority's answer, verified (DER). Raises TimestampError."""
+    """Return the authority's answer, verified (DER). Raises TimestampError."""
     request = TimestampRequestBuilder().data(message).hash_algorithm(HashAlgorithm.SHA256).build()
     try:
         reply = _post_within(authority, request.as_bytes())
@@ -140,7 +140,10 @@ def stamp_end(store: Store, run_id: str, authority: Authority | None) -> None:
 def timestamp_findings(
     checkpoints: Sequence[Checkpoint], stamps: Sequence[Timestamp], certificates: Path | None
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on the time stamps of a run. Raises TimestampError if the certificates cannot be read."""
+    """Return faults and notes on the time stamps of a run.
+
+    Raises TimestampError if the certificates cannot be read.
+    """
     signed = {item.seq: item for item in checkpoints}
     faults: list[Fault] = []
     notes: list[str] = []
@@ -187,7 +190,7 @@ def _verify(
 
 
 def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certificate]]:
-    """(roots, intermediates) in a PEM file; self-issued certificates are roots. Raises TimestampError."""
+    """Return (roots, intermediates) in a PEM file; self-issued certificates are roots. Raises TimestampError."""
     try:
         found = x509.load_pem_x509_certificates(path.read_bytes())
         roots = [certificate for certificate in found if certificate.issuer == certificate.subject]
@@ -201,7 +204,7 @@ def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certifi
 
 
 def _post_within(authority: Authority, body: bytes) -> bytes:
-    """The authority's answer within `timeout_s` in all. Raises OSError, ValueError.
+    """Return the authority's answer within `timeout_s` in all. Raises OSError, ValueError.
 
     A socket's timeout limits only single operations, not a name look-up without a network or an answer that trickles
     in. So the request runs in a thread, which is abandoned when the time is up.

@@ -32,9 +32,9 @@ class Fault:
     """One fault found by the verification."""
 
     run_id: str | None
-    seq: int | None  # of the event concerned
+    seq: int | None  # number of the event concerned
     file: str
-    what: str  # what is wrong
+    what: str  # the fault as text
 
     def __str__(self) -> str:
         place = ", ".join(
@@ -61,7 +61,7 @@ class FileState:
 
 @dataclass
 class ChainFacts:
-    """What other checks need from a chain, collected in one pass over its events."""
+    """The facts of a chain that other checks need, collected in one pass over its events."""
 
     sha256_at: dict[int, str] = field(default_factory=dict[int, str])
     jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # seq → payload about a job
@@ -69,7 +69,7 @@ class ChainFacts:
     key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
     people: list[tuple[Any, str]] = field(default_factory=list[tuple[Any, str]])  # account changes, sign-ins; times
     stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # time_stamp_kept, of the site
-    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of service_started
+    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # heads in service_started
     runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # run_signed, of the site
     written_again: list[tuple[int, SignaturesWrittenAgain]] = field(
         default_factory=list[tuple[int, SignaturesWrittenAgain]]
@@ -98,7 +98,7 @@ class ChainFacts:
         self._last_utc = at_utc
 
     def backwards_notes(self, run_id: str) -> list[str]:
-        """A note, if times run backwards within the chain: the order of the events is that of their numbers."""
+        """Return a note if times run backwards within the chain: the order of events is that of their numbers."""
         if not self.backwards:
             return []
         seq, back_s = self.backwards[0]
@@ -154,7 +154,10 @@ class ChainRows:
 def run_faults(
     run_id: str, rows: ChainRows, files: Mapping[str, FileState] | None, facts: ChainFacts
 ) -> Iterator[Fault]:
-    """Every fault of one run: first by event, then of the run as a whole. Fills `facts`; `files` None: not read."""
+    """Yield every fault of one run: first by event, then of the run as a whole.
+
+    Fills `facts`; `files` None: not read.
+    """
     by_seq: dict[int, list[Mapping[str, Any]]] = {}
     for row in rows.artefacts:
         by_seq.setdefault(int(row["seq"]), []).append(row)
@@ -185,7 +188,7 @@ def run_faults(
 def chain_fault(
     run_id: str, event_rows: Iterable[Mapping[Any, Any]], end: tuple[int, str]
 ) -> Fault | tuple[int, str]:
-    """The first fault in the events that follow `end` (seq, sha256), or the new end of the chain."""
+    """Return the first fault in the events that follow `end` (seq, sha256), or the new end of the chain."""
     seq, previous = end
     for row in event_rows:
         for fault in _link_faults(run_id, row, seq, previous):
@@ -207,7 +210,7 @@ def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str
 
 
 def _payload_of(row: Mapping[str, Any]) -> tuple[Any, tuple[ArtefactRef, ...], str]:
-    """(payload as plain data, its references, "") of a valid event; (None, (), what is wrong) of an invalid one."""
+    """Return (payload as plain data, references, "") of a valid event, (None, (), problem) of an invalid one."""
     try:
         payload = parse_canonical(row["payload"])
         PAYLOAD.validate_python(payload)
@@ -287,7 +290,7 @@ def _end_faults(
 
 
 def _same_moment(one_utc: str, other_utc: str) -> bool:
-    """Whether two times agree to a few seconds; older versions read the clock twice."""
+    """Return whether two times agree to a few seconds; older versions read the clock twice."""
     try:
         apart = datetime.fromisoformat(one_utc) - datetime.fromisoformat(other_utc)
     except (ValueError, TypeError):
@@ -341,7 +344,7 @@ def _end_of_job_faults(
 
 
 def summary(payload: Mapping[str, Any]) -> str:
-    """One line on an event's payload: its scalar fields in order, long ones cut."""
+    """Return one line on an event's payload: its scalar fields in order, long ones cut."""
     parts = [
         f"{name}={value}"
         for name, value in payload.items()

@@ -40,7 +40,10 @@ _NUMBERS = ("application_id",)  # in the database's header, which this software 
 
 
 def schema_faults(connection: Connection) -> Iterator[Fault]:
-    """Tables, indexes and triggers that differ from those of this software. A changed trigger may protect nothing."""
+    """Yield a fault for each table, index and trigger that differs from that of this software.
+
+    A changed trigger may protect nothing.
+    """
     for name in _NUMBERS:
         number = connection.execute(text(f"PRAGMA {name}")).scalar_one()
         if number != 0:
@@ -58,14 +61,14 @@ def schema_faults(connection: Connection) -> Iterator[Fault]:
 
 
 def reference_faults(connection: Connection) -> Iterator[Fault]:
-    """Rows that refer to a missing row, such as a lease on a run that does not exist."""
+    """Yield a fault for each row that refers to a missing row, such as a lease on a run that does not exist."""
     for row in connection.execute(text("PRAGMA foreign_key_check")):
         what = f"row {row.rowid} of the table {row.table} belongs to a row of {row.parent} that is not there"
         yield Fault(None, None, DATABASE_NAME, what)
 
 
 def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
-    """Rows of the event index that are missing, foreign, out of order or different from their event.
+    """Yield a fault for each row of the event index that is missing, foreign, out of order or unlike its event.
 
     With `every_run`, rows of runs that do not exist are reported too.
     """
@@ -91,7 +94,7 @@ def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: b
 
 
 def queue_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Jobs whose position in the queue is not the order in which they were enqueued, over all runs."""
+    """Yield a fault for each job whose position in the queue is not that in which it was enqueued, over all runs."""
     wanted = frozenset(run_ids)
     for row in connection.execute(text(_QUEUE)):
         if row.position != row.place and row.run_id in wanted:

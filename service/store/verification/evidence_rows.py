@@ -45,7 +45,7 @@ class EvidenceRows:
 
 
 def read_evidence(connection: Connection, run_id: str | None) -> EvidenceRows:
-    """The rows of a run and of the site, or with None those of every run. Raises UnknownRunError."""
+    """Return the rows of a run and of the site, or with None those of every run. Raises UnknownRunError."""
     damage = database_damage(connection)
     known = set(connection.execute(select(runs.c.run_id)).scalars())
     # A run whose row was deleted may still have events or checkpoints.
@@ -88,12 +88,12 @@ def read_evidence(connection: Connection, run_id: str | None) -> EvidenceRows:
 
 
 def database_damage(connection: Connection) -> tuple[str, ...]:
-    """What SQLite's own check of the database finds, in words; empty if it is sound."""
+    """Return the messages of SQLite's own check of the database; empty if it is sound."""
     found = connection.execute(text("PRAGMA integrity_check(5)")).scalars()
     return tuple(f"SQLite finds the database damaged: {line}" for line in found if line != "ok")
 
 
 def event_rows(connection: Connection, run_id: str) -> Iterator[Mapping[Any, Any]]:
-    """The events of a run in order, read a part at a time."""
+    """Yield the events of a run in order, read a part at a time."""
     statement = select(events).where(events.c.run_id == run_id).order_by(events.c.seq)
     return iter(connection.execution_options(yield_per=500).execute(statement).mappings())

@@ -45,7 +45,10 @@ def _file_state(folder: Path, sha256: str) -> FileState:
 
 
 def unlisted_files(folder: Path, listed: frozenset[str]) -> tuple[list[str], list[Fault]]:
-    """(notes, faults) on files that no row names. Leftovers of crashes are notes: partial and unrecorded files."""
+    """Return (notes, faults) on files that no row names.
+
+    Leftovers of crashes are notes: partial and unrecorded files.
+    """
     notes: list[str] = []
     foreign: list[Fault] = []
     for path in sorted(path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()):

@@ -21,7 +21,10 @@ _LOCKS = {"screen_locked": 1, "screen_unlocked": 0}
 
 
 def session_sha256(row: Mapping[str, Any]) -> str:
-    """SHA-256 of the columns of a session that never change. (A flipped bit may have turned text into bytes.)"""
+    """Return the SHA-256 of the columns of a session that never change.
+
+    (A flipped bit may have turned text into bytes.)
+    """
     values = {name: row[name] for name in _SESSION}
     return sha256_text(canonical({k: str(v) if isinstance(v, bytes) else v for k, v in values.items()}))
 
@@ -46,7 +49,7 @@ class _RecordedAccounts:
     """The state of accounts, links and sessions according to the site's chain."""
 
     accounts: dict[str, _AccountState] = field(default_factory=dict[str, _AccountState])
-    links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # by SHA-256 of the stored token_sha256
+    links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # links by SHA-256 of the stored token_sha256
     open_links: dict[str, str] = field(default_factory=dict[str, str])  # account → hash of its valid link
     unhashed_links: set[str] = field(default_factory=set[str])  # accounts with events older than these hashes
     sessions: dict[str, tuple[str, int]] = field(default_factory=dict[str, tuple[str, int]])  # screen → hash, locked
@@ -92,7 +95,7 @@ class _RecordedAccounts:
 def people_faults(
     events: Iterable[tuple[Mapping[str, Any], str]], accounts: Rows, links: Rows, sessions: Rows
 ) -> Iterator[Fault]:
-    """Rows that do not agree with the site's chain. What older chains do not record is not a fault.
+    """Yield a fault for each row that differs from the site's chain; what older chains do not record is none.
 
     Args:
         events: (payload, time) of account_changed and sign_in_recorded, oldest first.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ReportedPose:
-    """What a viewpoint_captured event holds of a view's place: its name, and where the controller had the arm."""
+    """A view's place as a viewpoint_captured event holds it: its name, and where the controller had the arm."""
 
     step: str
     viewpoint: str
@@ -75,7 +75,7 @@ class PoseFacts:
             self._away[seq] = AwayView(seq, view.viewpoint, *min(gaps))
 
     def findings(self, run_id: str) -> tuple[list[AwayView], list[str]]:
-        """Views whose newest image has a wrong pose, and notes on those that were taken again since."""
+        """Return views whose newest image has a wrong pose, and notes on those that were taken again since."""
         newest = set(self._last.values())
         faults = [away for seq, away in self._away.items() if seq in newest]
         return faults, list(self._notes(run_id, newest))

@@ -29,7 +29,7 @@ _DAMAGED = "the index by which auditors search is damaged"
 
 
 def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Events whose words a search would not find, or would find in another event.
+    """Yield a fault for each event whose words a search would not find, or would find in another event.
 
     All work is done on copies in a private database; the evidence is not opened for writing.
     """
@@ -53,7 +53,7 @@ def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Faul
 
 
 def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list[int], str]:
-    """Positions of events whose words differ, and what is wrong with the index itself ("" if nothing)."""
+    """Return positions of events whose words differ, and what is wrong with the index itself ("" if nothing)."""
     for name in _BOTH:
         private.execute(f"CREATE VIRTUAL TABLE {name} {_MADE}")
     for part, columns in _PARTS.items():

@@ -20,7 +20,7 @@ class KeyPeriod:
 
     key_id: str
     public_key: bytes
-    seq: int  # of its KeyChanged event
+    seq: int  # number of its KeyChanged event
     replaced_seq: int | None  # seq of its successor's KeyChanged; None for the key in use
 
 
@@ -34,7 +34,7 @@ class Keys:
 
 
 def key_history(site: ChainFacts, checkpoints: Sequence[Checkpoint]) -> Keys:
-    """The keys in the site's chain; `checkpoints` are the site's.
+    """Return the keys in the site's chain; `checkpoints` are the site's.
 
     A new key counts as introduced if its predecessor signed its KeyChanged. Otherwise a note says so: the old key may
     have been lost, and only a fingerprint written down elsewhere distinguishes the new key from an intruder's.
@@ -73,7 +73,7 @@ def checkpoint_faults(
     keys: Mapping[str, KeyPeriod],
     artefact_rows: Sequence[Mapping[str, Any]],
 ) -> Iterator[Fault]:
-    """Every fault of a run's checkpoints, given oldest first; `artefact_rows` in the order of the events."""
+    """Yield every fault of a run's checkpoints, given oldest first; `artefact_rows` in the order of the events."""
     digest, position = RowsDigest(), 0
     for item in checkpoints:
         while position < len(artefact_rows) and int(artefact_rows[position]["seq"]) <= item.seq:
@@ -110,7 +110,7 @@ def _fault(item: Checkpoint, what: str) -> Fault:
 
 
 def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[Fault]:
-    """The site's chain records the end of the run's chain at each start of the service; each must still be there."""
+    """Yield a fault for each end of the run's chain that the site's chain recorded at a start and that is gone."""
     for start_seq, heads in site.heads_at_start:
         if run_id in heads:
             seq, sha256 = heads[run_id]
@@ -125,7 +125,7 @@ def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[F
 def stamp_faults(
     site: ChainFacts, signed: Mapping[str, Sequence[Checkpoint]], stamps: Mapping[str, Sequence[Timestamp]]
 ) -> Iterator[Fault]:
-    """Time stamps that differ from those recorded in the site's chain; `signed` and `stamps` are by run.
+    """Yield a fault for each time stamp unlike that recorded in the site's chain; `signed`, `stamps` are by run.
 
     Stamps of other runs, and stamps made before the site's chain recorded them, are not checked.
     """
@@ -148,7 +148,7 @@ def stamp_faults(
 
 
 def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:
-    """Runs recorded as signed in the site's chain that are now missing, shorter or different: cut or deleted."""
+    """Yield a fault for each run that the site's chain recorded as signed and that is missing, cut or different."""
     gone: set[str] = set()
     for at, payload in site.runs_signed:
         run_id, seq = str(payload["run"]), int(payload["seq"])
@@ -163,7 +163,7 @@ def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, eve
 
 
 def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[Fault]:
-    """Events that are always signed at once (step passed, run ended) but have no signature: it was removed.
+    """Yield a fault for each event that is signed at once (step passed, run ended) and whose signature was removed.
 
     The last event may still be waiting for its signature, even if a worker has reported since.
     """
@@ -175,7 +175,7 @@ def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: C
 
 
 def late_signatures(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[str]:
-    """Notes on events that are always signed at once and have no signature of their own, only a later one.
+    """Yield notes on events that are always signed at once and have no signature of their own, only a later one.
 
     Signing may have failed then, or a signature may have been taken away, the events rewritten, and signed again.
     """
@@ -194,7 +194,7 @@ def late_signatures(run_id: str, checkpoints: Sequence[Checkpoint], chain: Chain
 
 
 def unsigned(run_id: str, checkpoints: Sequence[Checkpoint], events: int) -> tuple[int, str]:
-    """Number of events after the last checkpoint, and a note on them; (0, "") if there are none."""
+    """Return the number of events after the last checkpoint, and a note on them; (0, "") if there are none."""
     last = checkpoints[-1].seq if checkpoints else 0
     count = max(0, events - last)
     if count == 0:

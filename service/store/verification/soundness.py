@@ -18,7 +18,7 @@ def require_sound(store: Store, connection: Connection, run_id: str) -> None:
 
     Args:
         store: remembers how far each chain was verified, and what its last look at the signatures found.
-        connection: within a transaction.
+        connection: a connection within a transaction.
         run_id: the chain's run, or SITE.
     """
     found = _chain(store, connection, run_id)

@@ -33,7 +33,7 @@ from service.store.verification.search_checks import word_faults
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What was checked and what is wrong. `ok` means no faults; notes are not faults.
+    """A list of what was checked and of what is wrong. `ok` means no faults; notes are not faults.
 
     The site's chain is always checked too, because it holds the keys; the counts are of `runs` only.
     """
@@ -50,12 +50,12 @@ class AuditReport:
     timestamps: int
     unsigned_events: Mapping[str, int]  # run → events after its last checkpoint
     key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first, to compare as well
-    faults: tuple[Fault, ...]  # in the order of the chain
+    faults: tuple[Fault, ...]  # faults in the order of the chain
     notes: tuple[str, ...]
 
     @property
     def ok(self) -> bool:
-        """Whether the evidence verifies."""
+        """True if the evidence verifies."""
         return not self.faults
 
     @property
@@ -95,10 +95,10 @@ def verify(
     Args:
         data_dir: the data folder.
         run_id: one run, or None for all.
-        progress: called with the number of bytes hashed.
+        progress: a function that is called with the number of bytes hashed.
         certificates: PEM file of the time-stamp authorities. Without it, only the stamped content is checked.
         files: False skips the files; a note says so.
-        signatures_copy: a copy of the log of signatures, kept elsewhere, which shows whether the log was cut.
+        signatures_copy: a copy of the log of signatures from elsewhere, which shows whether the log was cut.
 
     Raises:
         UnknownRunError: there is no such run.
@@ -124,7 +124,7 @@ def verify(
 
 
 def _held_now(database: Database) -> int:
-    """The number of the journal's line that the database holds by now."""
+    """Return the number of the journal's line that the database holds by now."""
     with database.reading() as connection:
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
 
@@ -192,7 +192,7 @@ def _log_findings(
     keys: signatures.Keys,
     run_id: str | None,
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes of the log of signatures that is kept beside the database."""
+    """Return faults and notes of the log of signatures that lies beside the database."""
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
     faults, notes = log_findings(lines, evidence.checkpoints, public_keys, awaited=bool(site.key_changes))
     before, said = written_again_findings(site.written_again, run_id)
@@ -202,7 +202,7 @@ def _log_findings(
 def _check_chains(
     connection: Connection, evidence: EvidenceRows, files: Mapping[str, FileState] | None
 ) -> tuple[dict[str, ChainFacts], dict[str, list[Fault]]]:
-    """The facts and the faults of the site's chain and of each run's, by run; `files` None: they were not read."""
+    """Return facts and faults of the site's chain and of each run's, by run; `files` None: they were not read."""
     chains = {SITE: ChainFacts()} | {run: ChainFacts() for run in evidence.run_ids}
     found: dict[str, list[Fault]] = {run: [] for run in chains}
     for run, facts in chains.items():
@@ -220,7 +220,7 @@ def _check_chains(
 
 @dataclass(frozen=True, slots=True)
 class _SignatureCheck:
-    """What the signatures and time stamps of every chain are checked against."""
+    """The data against which the signatures and time stamps of every chain are checked."""
 
     evidence: EvidenceRows
     site: ChainFacts
@@ -229,7 +229,7 @@ class _SignatureCheck:
     certificates: Path | None
 
     def findings(self, run: str, facts: ChainFacts) -> tuple[list[Fault], list[str]]:
-        """Faults and notes of one chain."""
+        """Return faults and notes of one chain."""
         signed = self.evidence.checkpoints[run]
         rows = self.evidence.artefacts.get(run, [])
         from service.store.signatures.timestamps import (  # noqa: PLC0415 - X.509, which only a verification needs
@@ -257,7 +257,7 @@ class _SignatureCheck:
 
 
 def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
-    """Faults of the schema and of what is derived from the events: references, indexes, queue, words."""
+    """Yield faults of the schema and of what is derived from the events: references, indexes, queue, words."""
     yield from derived.schema_faults(connection)
     yield from derived.reference_faults(connection)
     yield from derived.index_faults(connection, runs, every_run=every_run)
@@ -268,7 +268,7 @@ def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: b
 def _counted(
     data_dir: Path, evidence: EvidenceRows, chains: Mapping[str, ChainFacts], files: Mapping[str, FileState]
 ) -> AuditReport:
-    """The figures of a report, without faults and notes."""
+    """Return the figures of a report, without faults and notes."""
     events = {run: len(chains[run].sha256_at) for run in evidence.run_ids}
     signed = evidence.checkpoints
     return AuditReport(
@@ -290,7 +290,7 @@ def _counted(
 
 
 def show(data_dir: Path, run_id: str) -> list[EvidenceRecord]:
-    """The events of a run, oldest first. Raises UnknownRunError, StoreError."""
+    """Return the events of a run, oldest first. Raises UnknownRunError, StoreError."""
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:
@@ -318,7 +318,7 @@ def show(data_dir: Path, run_id: str) -> list[EvidenceRecord]:
 
 
 def list_runs(data_dir: Path) -> list[RunRow]:
-    """All runs of a data folder, oldest first, read-only. Raises StoreError."""
+    """Return all runs of a data folder, oldest first, read-only. Raises StoreError."""
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:

@@ -26,7 +26,7 @@ _READ = [Depends(requires("read"))]
 def timeline_page(
     request: Request, audit: CurrentAudit, run_id: str, query: Annotated[EventQuery, Query()]
 ) -> Response:
-    """The events of a run in order, filtered and searched."""
+    """Show the events of a run in order, filtered and searched."""
     frame = audit_frame(audit, run_id, "/timeline")
     return _events(request, audit, run_id, query, "audit/timeline.html.j2", audit=frame)
 
@@ -67,7 +67,7 @@ def _events(
 
 @router.get("/audit/runs/{run_id}/events/{seq}", name="audit_event", dependencies=_READ, response_class=HTMLResponse)
 def event_page(request: Request, audit: CurrentAudit, person: SignedInPerson, run_id: str, seq: int) -> Response:
-    """One event with everything that is recorded of it."""
+    """Show one event with everything that is recorded of it."""
     frame = audit_frame(audit, run_id, "/timeline")
     return _event(request, audit, run_id, seq, may_correct=person.may("correct"), audit=frame)
 
@@ -94,7 +94,7 @@ def _event(
 
 @router.get("/audit/site", name="audit_site", dependencies=_READ, response_class=HTMLResponse)
 def site_page(request: Request, audit: CurrentAudit, query: Annotated[EventQuery, Query()]) -> Response:
-    """The site's chain: starts of the service, people, keys."""
+    """Show the site's chain: starts of the service, people, keys."""
     with audit.site.store.database.reading() as connection:
         starts = findings.events_of(connection, SITE, "service_started", newest=True)[-5:]
         keys = findings.events_of(connection, SITE, "key_changed", newest=True)
@@ -111,7 +111,7 @@ def site_page(request: Request, audit: CurrentAudit, query: Annotated[EventQuery
 
 @router.get("/audit/site/events/{seq}", name="audit_site_event", dependencies=_READ, response_class=HTMLResponse)
 def site_event_page(request: Request, audit: CurrentAudit, seq: int) -> Response:
-    """One event of the site's chain."""
+    """Show one event of the site's chain."""
     return _event(request, audit, SITE, seq, may_correct=False)
 
 
@@ -119,7 +119,7 @@ def site_event_page(request: Request, audit: CurrentAudit, seq: int) -> Response
 def artefacts_page(
     request: Request, audit: CurrentAudit, run_id: str, query: Annotated[ArtefactQuery, Query()]
 ) -> Response:
-    """Every file of a run."""
+    """Show every file of a run."""
     frame = audit_frame(audit, run_id, "/artefacts")
     wanted = query.wanted()
     with audit.site.store.database.reading() as connection:

@@ -66,7 +66,7 @@ def exports_page(
     person: SignedInPerson,
     run_id: RunId,
 ) -> Response:
-    """Whether the run may be exported, what has been exported, and the forms to export it."""
+    """Show whether the run may be exported, what has been exported, and the forms to export it."""
     log = site.run(run_id)
     refusal = refuse_export(log.protocol, log.state)
     released = next(
@@ -150,7 +150,7 @@ _LINES = ("creators", "funders")  # fields with one entry on each line
 
 
 class FormatForm(BaseModel):
-    """A data set in a format, as the form has it."""
+    """A data set in a format, as the page's form gives it."""
 
     form: str = Field(max_length=200)
     crop: str = Field("", pattern=r"^([1-9][0-9]{0,5}x[1-9][0-9]{0,5})?$")
@@ -184,7 +184,7 @@ class FormatForm(BaseModel):
         return text
 
     def wanted(self) -> WantedExport:
-        """What is asked for. What the fields of the statement leave out is the protocol's."""
+        """Return the export that is asked for. What the fields of the statement leave out is the protocol's."""
         return WantedExport(self.form, self.crop, self.crops, self.anonymous, self._stated(), self.version)
 
     def _stated(self) -> DataSetStatement:
@@ -273,13 +273,13 @@ def exported_file(
 
 
 def _may_stop(exports: Exports, person: Person, run_id: str) -> bool:
-    """Whether a person may stop what is running: who may export stops everything, others what they began."""
+    """Return whether a person may stop what is running: who may export everything, others what they started."""
     state = exports.state(run_id)
     return person.may("export") or state is None or not state.pending or state.by == person.account
 
 
 def _lines(text: str) -> tuple[str, ...]:
-    """The lines that are not empty."""
+    """Return the lines that are not empty."""
     return tuple(filter(None, (line.strip() for line in text.splitlines())))
 
 

@@ -39,7 +39,7 @@ _TABS = (
 
 @dataclass
 class AuditState:
-    """What is computed for one data folder."""
+    """The background computations for one data folder."""
 
     site: Site
     digests: IncrementalResults[Digest]
@@ -84,7 +84,7 @@ class AuditFrame:
 
 
 def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
-    """The frame of one run's page at `tab`. Raises UnknownRunError."""
+    """Return the frame of one run's page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
         found = rows.runs(connection, run_id)
     if not found:
@@ -104,7 +104,7 @@ def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
 
 
 def link(address: str, query: Mapping[str, str | int | None]) -> str:
-    """An address with its query; empty fields are left out."""
+    """Return an address with its query; empty fields are left out."""
     fields = {name: value for name, value in query.items() if value not in ("", None, 0)}
     return f"{address}?{urlencode(fields)}" if fields else address
 
@@ -113,7 +113,7 @@ LONGEST = 200  # characters of a filter; more is cut
 
 
 def cut(text: str) -> str:
-    """The text of a filter, without outer blanks and cut to the longest length."""
+    """Return the text of a filter, without outer blanks and cut to the longest length."""
     return text[:LONGEST].replace("\0", "")
 
 
@@ -136,7 +136,7 @@ class RunQuery(BaseModel):
     page: int = 1
 
     def wanted(self) -> RunFilter:
-        """The filter of runs that these fields describe."""
+        """Return the filter of runs that these fields describe."""
         return RunFilter(**self.model_dump(exclude={"page"}))
 
 
@@ -152,7 +152,7 @@ class EventQuery(BaseModel):
     before: int = 0
 
     def wanted(self) -> EventFilter:
-        """The filter of events that these fields describe."""
+        """Return the filter of events that these fields describe."""
         return EventFilter(self.step, self.device, self.person, self.kind, self.q)
 
 
@@ -167,5 +167,5 @@ class ArtefactQuery(BaseModel):
     page: int = 1
 
     def wanted(self) -> ArtefactFilter:
-        """The filter of files that these fields describe."""
+        """Return the filter of files that these fields describe."""
         return ArtefactFilter(self.kind, self.step, self.device, self.viewpoint, self.q)

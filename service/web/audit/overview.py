@@ -86,7 +86,7 @@ def protocol_identity(store: Store, run_id: str, protocol: str, version: str) ->
 
 
 def _source(store: Store, approved: dict[str, Approval], sha256: str) -> str:
-    """The text of a content: from its approval, else from the evidence of a run; "" if neither can be read."""
+    """Return the text of a content: from its approval, else from the evidence of a run; "" if neither can be read."""
     if sha256 in approved:
         return approved[sha256].payload.source
     try:
@@ -111,18 +111,18 @@ _READ = [Depends(requires("read"))]
 
 @dataclass(frozen=True, slots=True)
 class _Recorded:
-    """What the first page reads from the run's events and from the index of them.
+    """The data that the first page reads from the run's events and from the index of them.
 
     Attributes:
-        root: first event of the run, None if it is missing.
+        root: first event of the run; None if it is missing.
         corrected: number of corrections.
-        devices: as they were opened.
+        devices: the devices' identities, as they were opened.
         session: last start of the program that drove the run.
         sessions: number of starts.
         exports: events of exports.
-        signatures: of steps, and of the run's release.
+        signatures: the signatures of steps, and of the run's release.
         failures: number of failed exposures of each step.
-        bodies: of the cameras.
+        bodies: the bodies of the cameras.
     """
 
     root: EventRow | None
@@ -156,7 +156,7 @@ def _recorded(audit: AuditState, run_id: str, digest: Digest | None) -> _Recorde
 
 @router.get("/audit/runs/{run_id}", name="audit_run", dependencies=_READ, response_class=HTMLResponse)
 def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """The first page of a run: deviations first."""
+    """Show the first page of a run: deviations first."""
     frame = audit_frame(audit, run_id, "")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
@@ -190,7 +190,10 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
 
 
 def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[PendingResult]:
-    """Results that are still being computed, or that failed. The whole run is read only if there may be any."""
+    """Return results that are still being computed, or that failed.
+
+    The whole run is read only if there may be any.
+    """
     failed = digest is not None and digest.facets.kinds.get("job_failed", 0) > 0
     if digest is None or digest.problem or not (failed or audit.site.store.open_jobs(run_id)):
         return []
@@ -201,7 +204,7 @@ def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[Pend
     "/audit/runs/{run_id}/deviations", name="audit_deviations", dependencies=_READ, response_class=HTMLResponse
 )
 def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: str = "", page: int = 1) -> Response:
-    """All deviations, or what is in one group of them or of what else is recorded."""
+    """Show all deviations, or what is in one group of them or of what else is recorded."""
     frame = audit_frame(audit, run_id, "")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
@@ -232,7 +235,7 @@ _RUNS_A_PAGE = 25
 
 @router.get("/audit", name="audit", dependencies=_READ, response_class=HTMLResponse)
 def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, Query()]) -> Response:
-    """The runs, newest first."""
+    """Show the runs, newest first."""
     wanted = query.wanted()
     with audit.site.store.database.reading() as connection:
         every = rows.runs(connection)

@@ -55,7 +55,7 @@ class AccuracyRow:
     reprojection_px: float | None
     images: str
     late: str
-    limit: str  # "" where the protocol sets none
+    limit: str  # "" if the protocol sets none
     within: bool | None
     own: bool  # the run's own registration: what a data set is exported with
 
@@ -67,7 +67,7 @@ class AccuracyRow:
     response_class=HTMLResponse,
 )
 def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """Every gate of every step, in the order of the protocol."""
+    """Show every gate of every step, in the order of the protocol."""
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
     return render(
@@ -80,7 +80,7 @@ def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
 
 
 def gates_of(digest: Digest) -> list[StepGates]:
-    """The steps that have gates."""
+    """Return the steps that have gates."""
     protocol, state = digest.protocol, digest.state
     if protocol is None or state is None:
         return []
@@ -106,7 +106,7 @@ def _explained(protocol: Protocol, step: Step, now: StepState, skipped: frozense
 
 
 def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:
-    """The accuracy on the control spheres of every source of poses; empty before the evaluation."""
+    """Return the accuracy on the control spheres of every source of poses; empty before the evaluation."""
     if digest is None or digest.protocol is None or digest.state is None:
         return []
     return _accuracy(digest.protocol, digest.state)
@@ -142,7 +142,7 @@ def _accuracy(protocol: Protocol, state: RunState) -> list[AccuracyRow]:
     response_class=HTMLResponse,
 )
 def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """Devices with versions, clocks, troubles; sessions and software."""
+    """Show devices with versions, clocks, troubles; sessions and software."""
     frame = audit_frame(audit, run_id, "/devices")
     with audit.site.store.database.reading() as connection:
         opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
@@ -177,7 +177,7 @@ _READ = [Depends(requires("read"))]
     "/audit/runs/{run_id}/corrections", name="audit_corrections", dependencies=_READ, response_class=HTMLResponse
 )
 def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: int = 1) -> Response:
-    """Old and new: corrected values, steps done again, views taken again."""
+    """Show old and new: corrected values, steps done again, views taken again."""
     frame = audit_frame(audit, run_id, "/corrections")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
@@ -251,7 +251,7 @@ def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
     "/audit/runs/{run_id}/verification", name="audit_verification", dependencies=_READ, response_class=HTMLResponse
 )
 def verification_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """What the last verification found, or how far the current one is."""
+    """Show what the last verification found, or how far the current one is."""
     return render(request, "audit/verification.html.j2", audit=audit_frame(audit, run_id, "/verification"))
 
 

@@ -48,11 +48,11 @@ class PoseAdvice:
     """A board pose worth taking, as the pose of the camera relative to the board.
 
     Attributes:
-        tilt_deg: of the optical axis from the board's normal.
-        azimuth_deg: from which side, in the board's plane.
-        roll_deg: of the image about the optical axis, against the one nearest to upright.
-        distance_m: to the board's middle.
-        sigma_mm, sigma_deg: of the hand-eye transform once this and the earlier poses are taken, 1σ.
+        tilt_deg: tilt of the optical axis from the board's normal.
+        azimuth_deg: direction of the tilt, in the board's plane.
+        roll_deg: roll of the image about the optical axis, against the one nearest to upright.
+        distance_m: distance to the board's middle.
+        sigma_mm, sigma_deg: 1σ of the hand-eye transform once this and the earlier poses are taken.
         flange_mm: position of the flange in the base frame.
     """
 
@@ -69,7 +69,7 @@ _KEPT = TypeAdapter(tuple[PoseAdvice, ...])
 
 
 def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]]:
-    """The ninths of the image in which cells hold no corner, worst first: name, such cells, all cells."""
+    """Return the ninths of the image in which cells hold no corner, worst first: name, such cells, all cells."""
     grid = np.array(corners)
     out: list[tuple[str, int, int]] = []
     for r, rows in enumerate(np.array_split(np.arange(grid.shape[0]), 3)):
@@ -90,7 +90,7 @@ def advised_poses(
     data: Path,
     key: str,
 ) -> tuple[PoseAdvice, ...]:
-    """Suggested poses, computed once for a calibration and cached; none if the linearised problem has no solution.
+    """Return suggested poses, computed once for a calibration and cached; none if the linear problem has no solution.
 
     Args:
         hand_eye: the hand-eye calibration.
@@ -99,7 +99,7 @@ def advised_poses(
         board: the calibration board.
         arm: model name; poses that it does not reach are left out, where its kinematics are known.
         data: the data folder, in which the result is cached.
-        key: of the calibration, such as its file's hash.
+        key: the key of the calibration, such as its file's hash.
     """
 
     def make() -> bytes:
@@ -142,7 +142,7 @@ def _advise(
 
 
 def _advice(pose: SuggestedPose, T_board_camera: Transform, middle_m: Array) -> PoseAdvice:
-    """A suggested pose as a person can follow it; `middle_m` (3,) is the middle of the board, in its frame."""
+    """Return a suggested pose as a person can follow it; `middle_m` (3,) is the middle of the board, in its frame."""
     away = T_board_camera[:3, 3] - middle_m
     axis, top = T_board_camera[:3, 2], -T_board_camera[:3, 1]
     x, y, z = (mm(float(v)) for v in pose.T_base_flange[:3, 3])
@@ -189,10 +189,10 @@ _TICK = 12.0
 
 
 def board_plan_svg(text: str, counts: Sequence[Sequence[int]], T_base_camera: Array, approach: Array) -> str:
-    """An SVG document.
+    """Return the drawing of a plan of board images as an SVG document.
 
     Args:
-        text: what the plan is predicted to give.
+        text: the prediction of what the plan gives.
         counts: (8, 12) corners expected in each cell of the image.
         T_base_camera: (K, 4, 4) planned poses, those taken already included.
         approach: (3,) horizontal unit vector from the scene towards the robot, which is below in the drawing.
@@ -249,7 +249,7 @@ def _text(
 
 
 def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
-    """The plan as an SVG document, computed once for each recorded state of a step.
+    """Return the plan as an SVG document, computed once for each recorded state of a step.
 
     Raises:
         ProtocolError: no such step.

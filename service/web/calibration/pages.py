@@ -42,18 +42,18 @@ router = APIRouter(tags=["calibration"])
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPage:
-    """What the page of a calibration shows.
+    """The data that the page of a calibration shows.
 
     Attributes:
-        run_id: of the run.
+        run_id: the run's identifier.
         found: the calibration in force.
-        charts: of the intrinsics; None if they are not solved.
-        hand_eye_chart: None without a hand-eye calibration.
-        images: of the board, with their residuals.
+        charts: the charts of the intrinsics; None if they are not solved.
+        hand_eye_chart: the chart of the hand-eye calibration; None without one.
+        images: the images of the board, with their residuals.
         held_out: median and maximum error of the board's position by images that were not used, mm.
         depends: acceptances on which the calibration depends.
         regions: parts of the image without corners: name, empty cells, all cells.
-        poses: of the board that would help most.
+        poses: the poses of the board that would help most.
         further: cameras of the rig that are calibrated by themselves.
     """
 
@@ -71,7 +71,7 @@ class CalibrationPage:
 
 @dataclass(frozen=True, slots=True)
 class CertificatePage:
-    """What the certificate shows; its fields are those of CalibrationPage, and `head`, the last event of the run."""
+    """The data that the certificate shows: fields of CalibrationPage, and `head`, the last event of the run."""
 
     run_id: str
     found: Calibration
@@ -84,7 +84,7 @@ class CertificatePage:
 
 @router.get("/runs/{run_id}/calibration", name="calibration", dependencies=[Depends(requires("read"))])
 def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
-    """Whether the calibration is good, in pixels and in millimetres, and what would make it better."""
+    """Show whether the calibration is good, in pixels and in millimetres, and what would make it better."""
     log = site.run(run_id)
     found = calibration_of(log)
     frame = run_frame(site, run_id)
@@ -108,7 +108,7 @@ def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
 
 @router.get("/runs/{run_id}/board-plan.svg", name="board_plan", dependencies=[Depends(requires("read"))])
 def board_plan(site: CurrentSite, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
-    """The board images of a calibration step as they are planned: corners over the image, and the camera's places."""
+    """Show the planned board images of a calibration step: corners over the image, and the camera's places."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.boards import board_plan_of  # noqa: PLC0415
 
@@ -122,7 +122,7 @@ def board_plan(site: CurrentSite, run_id: RunId, step: Annotated[str, Query(max_
     dependencies=[Depends(requires("read"))],
 )
 def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
-    """The calibration on a page to print."""
+    """Show the calibration on a page to print."""
     log = site.run(run_id)
     found = calibration_of(log)
     if found is None:
@@ -144,7 +144,7 @@ def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
 def _rendered(
     request: Request, template: str, page: CalibrationPage | CertificatePage, frame: RunFrame
 ) -> HTMLResponse:
-    """A page with the words for measures and gates."""
+    """Return a page with the words for measures and gates."""
     return render(
         request,
         template,
@@ -165,7 +165,7 @@ def _depends(log: RunRecord, found: Calibration) -> list[AcceptedGate]:
 def _advice(
     site: Site, log: RunRecord, found: Calibration
 ) -> tuple[list[tuple[str, int, int]], tuple[PoseAdvice, ...]]:
-    """Parts of the image without corners, and board poses worth taking."""
+    """Return parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.boards import advised_poses, empty_regions  # noqa: PLC0415
 

@@ -33,7 +33,7 @@ class ImageRow:
     residual_deg: float | None
     held_out_mm: float | None
     held_out_deg: float | None
-    sha256: str  # of the photograph
+    sha256: str  # the photograph's hash
     step: str
     use: BoardUse
 
@@ -44,13 +44,13 @@ class Calibration:
 
     Attributes:
         steps: those that solved something, in order.
-        camera: with its distortion.
-        intrinsics: what is known about the camera besides its parameters; None: not solved yet.
-        hand_eye: None: not solved yet.
+        camera: the camera with its distortion.
+        intrinsics: the rest that is known about the camera besides its parameters; None: not solved yet.
+        hand_eye: the hand-eye calibration; None: not solved yet.
         best: the answer that the registration uses: with the arm's correction where there is one.
         captures: the board images, of the step whose images were used.
         artefact: calibration.json of the last step.
-        states: of all steps of the run.
+        states: the states of all steps of the run.
     """
 
     steps: tuple[tuple[Step, StepState], ...]
@@ -76,7 +76,7 @@ class Charts:
 
 
 def calibration_of(log: RunRecord) -> Calibration | None:
-    """The calibration in force; None before a calibration step has an answer."""
+    """Return the calibration in force; None before a calibration step has an answer."""
     solved = [
         (step, log.state.steps[step.id])
         for step in log.protocol.steps
@@ -114,13 +114,13 @@ class _Robots(BaseModel):
 
 
 def _board_images(log: RunRecord, step: Step) -> tuple[RecordedView, ...]:
-    """The valid board images that a calibration step used: its own, or those of an earlier step."""
+    """Return the valid board images that a calibration step used: its own, or those of an earlier step."""
     source = step.params_as(Params).images_of or step.id
     return tuple(capture.payload for capture in captures_of(log, source) if capture.replaced is None)
 
 
 def charts_of(calibration: Calibration) -> Charts | None:
-    """The charts of the intrinsics; None if they are not solved."""
+    """Return the charts of the intrinsics; None if they are not solved."""
     record = calibration.intrinsics
     if record is None or record.coverage is None or record.residuals is None or record.uncertainty is None:
         return None
@@ -159,7 +159,7 @@ def charts_of(calibration: Calibration) -> Charts | None:
 
 
 def hand_eye_chart(calibration: Calibration) -> DotPlot | None:
-    """Distance of the board as each image places it from its place by the others; None without a hand-eye."""
+    """Return how far each image places the board from its place by the others; None without a hand-eye."""
     best = calibration.best
     if best is None:
         return None
@@ -175,7 +175,7 @@ def hand_eye_chart(calibration: Calibration) -> DotPlot | None:
 
 
 def image_rows(calibration: Calibration) -> list[ImageRow]:
-    """Every board image with its residuals, unused images first."""
+    """Return every board image with its residuals, unused images first."""
     record = calibration.intrinsics or Intrinsics()
     validation = record.cross_validation
 
@@ -207,7 +207,7 @@ def image_rows(calibration: Calibration) -> list[ImageRow]:
 
 
 def held_out_mm(calibration: Calibration) -> tuple[float, float] | None:
-    """Median and maximum error of the board's position by images that the hand-eye calibration did not use, mm."""
+    """Return the median and maximum error of the board's position, mm, by images that the hand-eye did not use."""
     if calibration.best is None:
         return None
     values = list(calibration.best.residuals.held_out_mm.values())
@@ -224,7 +224,7 @@ def _limit(calibration: Calibration, measure: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class StepSignature:
-    """Who signed a calibration step, when, and with which meaning."""
+    """The signature of a calibration step: who signed, when, and with which meaning."""
 
     step: str
     who: str
@@ -243,13 +243,13 @@ class LaterCheck:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What a certificate states in addition to the figures.
+    """The statements of a certificate in addition to the figures.
 
     Attributes:
         camera: EXIF of the first board image: settings, lens, body.
         robots: name in the rig, model and serial number of each whose flange carried the camera.
         passed: number, hash and time of the event by which the last step passed; None: it has not.
-        checks: of later images.
+        checks: the checks of later images.
         stops: troubles of the robot or camera since.
     """
 
@@ -265,7 +265,7 @@ class Certificate:
 
 
 def _later_checks(log: RunRecord, calibrated: set[str]) -> list[LaterCheck]:
-    """The steps outside the calibration that compared their images with it."""
+    """Return the steps outside the calibration that compared their images with it."""
     steps = [(step, log.state.steps[step.id]) for step in log.protocol.steps if step.id not in calibrated]
     return [
         LaterCheck(step.title, len(done.captured), int(done.measures["optics_departures"]))
@@ -275,7 +275,7 @@ def _later_checks(log: RunRecord, calibrated: set[str]) -> list[LaterCheck]:
 
 
 def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
-    """The certificate, from the recorded events alone."""
+    """Return the certificate, from the recorded events alone."""
     state, (_, there) = log.state, calibration.steps[-1]
     first = calibration.captures[0] if calibration.captures else None
     ids = {step.id for step, _ in calibration.steps}

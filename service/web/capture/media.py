@@ -45,7 +45,7 @@ _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]+")
 
 @router.get("/vendor/plotly.js", name="plotly_script", response_class=FileResponse)
 def plotly_script(request: Request, site: CurrentSite) -> Response:
-    """plotly's script from the installed package; the 3D view loads it in its sandboxed frame."""
+    """Serve plotly's script from the installed package; the 3D view loads it in its sandboxed frame."""
     path = _plotly()
     stat = path.stat()
     tag = f'"{stat.st_size:x}-{stat.st_mtime_ns:x}"'
@@ -81,7 +81,7 @@ def run_file(
     sha256: Sha256,
     thumbnail: Annotated[int | None, Query(ge=64, le=640)] = None,
 ) -> Response:
-    """A file of this run's evidence, hashed again before it is sent; or a small copy of a picture."""
+    """Show a file of this run's evidence, hashed again before it is sent; or a small copy of a picture."""
     ref = recorded_file(site, run_id, sha256)
     tag = f'"{sha256}{"" if thumbnail is None else f"-{nearest_width(thumbnail)}"}"'
     if request.headers.get("if-none-match") == tag:
@@ -103,14 +103,14 @@ def run_file(
 
 
 class ImageQuery(BaseModel):
-    """Which image of a viewpoint to show, and how.
+    """The query for an image of a viewpoint, and for how to show it.
 
     Attributes:
-        step: that took it; "" for the last step that has it.
-        attempt: of the step; None for the valid image.
+        step: the step that took it; "" for the last step that has it.
+        attempt: attempt of the step; None for the valid image.
         seq: event of the image; None for the valid image.
         width: wanted width in pixels; the copy has the nearest width on offer.
-        marked: whether outlines of the spheres are drawn over it.
+        marked: true if outlines of the spheres are drawn over it.
         device: a further camera, whose image is shown; "" for the first one.
     """
 
@@ -135,7 +135,7 @@ def viewpoint_image(
     viewpoint: Viewpoint,
     wanted: Annotated[ImageQuery, Query()],
 ) -> Response:
-    """A copy of a viewpoint's image for the screen."""
+    """Show a copy of a viewpoint's image for the screen."""
     log = site.run(run_id)
     capture = find_capture(log, viewpoint, step=wanted.step, attempt=wanted.attempt, seq=wanted.seq)
     if capture is None:
@@ -151,7 +151,7 @@ def viewpoint_image(
 
 
 def _photograph(log: RunRecord, capture: Capture, device: str) -> ArtefactRef:
-    """The photograph of a camera at a viewpoint. HTTP 404 if it did not expose there."""
+    """Return the photograph of a camera at a viewpoint. HTTP 404 if it did not expose there."""
     if not device:
         return capture.payload.artefacts[0]
     for one in further_of(log, capture):
@@ -168,7 +168,7 @@ def _photograph(log: RunRecord, capture: Capture, device: str) -> ArtefactRef:
     response_class=FileResponse,
 )
 def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max_length=64)] = "") -> Response:
-    """A camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
+    """Show a camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
     if camera and camera not in rig_cameras(site.run(run_id)):
         raise HTTPException(404, "the rig of this run has no further camera of this name")
     site.run(run_id)
@@ -186,7 +186,7 @@ def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max
 
 
 def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
-    """What this run has recorded about a file. HTTP 404 if this run has not recorded it, even if another run has."""
+    """Return this run's record of a file, or raise HTTP 404 if it has none, even if another run has one."""
     with site.store.database.reading() as connection:
         row = connection.execute(
             select(artefacts)
@@ -200,7 +200,7 @@ def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
 
 
 def mark_source(log: RunRecord, capture: Capture, device: str = "") -> str:
-    """A key of what would be drawn over an image, which changes when better outlines are known; "" for nothing."""
+    """Return a key of what would be drawn over an image; it changes with better outlines and is "" for nothing."""
     from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
 
     found = outlines_of(log, capture, device)
@@ -209,7 +209,7 @@ def mark_source(log: RunRecord, capture: Capture, device: str = "") -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Marks:
-    """What is drawn over an image; `source` changes with it, and is "" for nothing."""
+    """The marks that are drawn over an image; `source` changes with them, and is "" for none."""
 
     log: RunRecord
     capture: Capture
@@ -218,7 +218,10 @@ class _Marks:
 
 
 def _reduced(site: Site, ref: ArtefactRef, width: int, drawn: _Marks | None = None) -> Path:
-    """The cached copy. HTTP 415 if the file is not a picture; the original is hashed again when a copy is made."""
+    """Return the cached copy.
+
+    HTTP 415 if the file is not a picture; the original is hashed again when a copy is made.
+    """
     if ref.media_type not in PICTURES:
         raise HTTPException(415, f"{safe_name(ref.original_name, ref.sha256)} is not a picture")
 

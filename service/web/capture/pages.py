@@ -35,15 +35,15 @@ LISTED = 200  # viewpoints on one page of the table
 
 
 class CaptureQuery(BaseModel):
-    """Which step and which of its images to show; the page chooses what is not given."""
+    """The query for a step and for its images to show; the page chooses what is not given."""
 
     step: str = Field("", max_length=64)
     viewpoint: str = Field("", max_length=64)
     seq: int = Field(0, ge=0, le=2**53)  # event of an image; 0: the newest
-    page: int = Field(1, ge=1, le=100_000)  # of the contact sheet
+    page: int = Field(1, ge=1, le=100_000)  # page of the contact sheet
     views: int = Field(0, ge=0, le=100_000)  # page of the table; 0: the one that shows where the run is
     replaced: bool = False  # list replaced images too
-    plain: bool = False  # without the outlines of spheres
+    plain: bool = False  # leave out the outlines of spheres
     device: str = Field("", max_length=64)  # a further camera, whose images are shown; "": the first one
 
 
@@ -55,17 +55,17 @@ class ViewTable:
     """The viewpoints of a step, and a page of the table that lists them."""
 
     views: list[StepViewpoint]
-    rows: list[StepViewpoint]  # on this page
+    rows: list[StepViewpoint]  # the rows on this page
     page: int
     pages: int
-    counts: Mapping[ViewState, int]  # of all viewpoints; none is 0
+    counts: Mapping[ViewState, int]  # number of viewpoints in each state, without zeros
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSheet:
     """A page of the contact sheet."""
 
-    images: list[SheetImage]  # on this page
+    images: list[SheetImage]  # the images on this page
     devices: list[str]  # further cameras that took images in this step
     replaced: int  # images of the step that no longer count
     page: int
@@ -79,29 +79,29 @@ class ChosenImage:
     capture: Capture | None
     camera: CameraImage | None  # the camera whose image is large
     cameras: list[CameraImage]  # all that exposed at this viewpoint
-    sums: list[Verdict]  # of all images up to this one
+    sums: list[Verdict]  # verdicts on all images up to this one
     registered: bool  # the spheres have the numbers of the registration
 
 
 @dataclass(frozen=True, slots=True)
 class StepImages:
-    """Everything about the images of one step.
+    """The images of one step, and everything that the page shows about them.
 
     Attributes:
-        run_id: of the run.
-        step: whose images they are.
-        table: of its viewpoints.
-        sheet: of its images.
+        run_id: the run's identifier.
+        step: the step whose images they are.
+        table: the table of its viewpoints.
+        sheet: the contact sheet of its images.
         image: the large one.
         drawings: the viewpoints from above, one drawing a station.
         view: the chosen viewpoint.
-        redo: whether it may be redone; None without a chosen viewpoint.
+        redo: the answer to whether it may be redone; None without a chosen viewpoint.
         in_control: the person's screen has control of the run.
-        advice, suggestions: what the images lack, and the views that would help most.
+        advice, suggestions: a text on what the images need, and the views that would help most.
         following: the page shows the newest image.
-        query: what the page was asked for.
-        tail: the same as the query of an address, for the parts of the page.
-        words, tones: of the states of viewpoints.
+        query: the query of the page.
+        tail: `query` as the query of an address, for the parts of the page.
+        words, tones: labels and tones of the states of viewpoints.
         reasons: presets for a redo.
         csrf: token of the forms.
     """
@@ -128,13 +128,13 @@ class StepImages:
 
 @dataclass(frozen=True, slots=True)
 class CapturePage:
-    """What the page shows."""
+    """The data that the page shows."""
 
     run_id: str
     log: RunRecord
-    steps: list[Step]  # that take images with the robot
+    steps: list[Step]  # the steps that take images with the robot
     held: bool  # a person holds the camera in another step
-    further_cameras: tuple[str, ...]  # of the rig
+    further_cameras: tuple[str, ...]  # the rig's further cameras
     images: StepImages | None  # None where no step takes images with the robot
 
 
@@ -142,7 +142,7 @@ class CapturePage:
 def capture(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, wanted: Wanted
 ) -> HTMLResponse:
-    """Everything about the images of one step."""
+    """Show everything about the images of one step."""
     shown = _shown(site, person, run_id, wanted)
     return render(request, "capture/capture.html.j2", shown, frame=run_frame(site, run_id))
 
@@ -151,7 +151,7 @@ def capture(
 def capture_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, wanted: Wanted
 ) -> HTMLResponse:
-    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
+    """Show parts of the page, all from the same moment, for the script that keeps the page up to date."""
     shown = _shown(site, person, run_id, wanted)
     return render(request, "capture/parts.html.j2", shown, names=names.split(","))
 
@@ -205,7 +205,7 @@ def _of_step(site: Site, person: Person, log: RunRecord, step: Step, wanted: Cap
 
 
 def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None:
-    """The image of an event, else the newest valid one of the viewpoint, else the newest valid one."""
+    """Return the image of an event, else the newest valid one of the viewpoint, else the newest valid one."""
     by_event = next((c for c in captures if wanted.seq and c.seq == wanted.seq), None)
     if by_event is not None:
         return by_event
@@ -215,7 +215,7 @@ def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None
 
 
 def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) -> ViewTable:
-    """A page of the table: the one asked for, or the one with the viewpoint that is shown or comes next."""
+    """Return a page of the table: the one asked for, or the one with the viewpoint that is shown or comes next."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
 
     pages = max(1, -(-len(views) // LISTED))
@@ -232,7 +232,7 @@ def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) ->
 
 
 def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> ContactSheet:
-    """A page of the contact sheet: images with something wrong first, then newest first."""
+    """Return a page of the contact sheet: images with something wrong first, then newest first."""
     from service.web.capture.view import devices_in, sheet_image  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
@@ -257,7 +257,7 @@ def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: Capt
 def _image(
     log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture], device: str
 ) -> ChosenImage:
-    """The large image, with what is known about it."""
+    """Return the large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
     from service.web.capture.view import camera_images  # noqa: PLC0415
     from service.web.record.outlines import displayed_registration  # noqa: PLC0415
@@ -276,7 +276,7 @@ def _image(
 
 
 def _drawings(log: RunRecord, views: Sequence[StepViewpoint], name: str) -> list[PlanDrawing]:
-    """The plan of the viewpoints of each known station."""
+    """Return the plan of the viewpoints of each known station."""
     from service.web.capture import plan_drawing  # noqa: PLC0415
     from service.web.record import planned_poses  # noqa: PLC0415
 
@@ -291,6 +291,6 @@ def _drawings(log: RunRecord, views: Sequence[StepViewpoint], name: str) -> list
 
 
 def _is_problem(capture: Capture, use: BoardUse | None) -> bool:
-    """Whether something is wrong with an image that has not been replaced."""
+    """Return whether something is wrong with an image that has not been replaced."""
     wrong = use.used is False if use is not None else not all(capture.payload.verdicts.values())
     return wrong and capture.replaced is None

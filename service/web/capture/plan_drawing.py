@@ -29,7 +29,7 @@ class Symbol:
     state: ViewState
     x: float
     y: float
-    tip_x: float  # of the line towards what it looks at
+    tip_x: float  # tip of the line towards what it looks at
     tip_y: float
 
 
@@ -40,7 +40,7 @@ class PlanDrawing:
     Attributes:
         specimen: left, top, width, height.
         bar: length of 100 mm.
-        robot: where its base stands; None when it is outside of the drawing (below it).
+        robot: the place of its base; None when it is outside of the drawing (below it).
     """
 
     station: str
@@ -54,7 +54,7 @@ class PlanDrawing:
 
 
 def plan_drawing(station: StationPlan, views: Sequence[StepViewpoint], chosen: str = "") -> PlanDrawing | None:
-    """The drawing; None without a viewpoint whose position is known. `chosen` is always drawn."""
+    """Return the drawing; None without a viewpoint whose position is known. `chosen` is always drawn."""
     placed = [(v, v.position_m, v.looks) for v in views if v.position_m is not None and v.looks is not None]
     if not placed:
         return None
@@ -96,7 +96,7 @@ def plan_drawing(station: StationPlan, views: Sequence[StepViewpoint], chosen: s
 
 
 def _apart(symbols: Sequence[Symbol], chosen: str) -> list[Symbol]:
-    """One of the viewpoints that would overlap; the chosen and the next viewpoint are always kept."""
+    """Return one of the viewpoints that would overlap each other, and always the chosen and the next viewpoint."""
     wanted = [symbol for symbol in symbols if symbol.name == chosen or symbol.state == "next"]
     kept: dict[tuple[int, int], Symbol] = {}
     for symbol in sorted(symbols, key=lambda s: _FIRST.index(s.state)):
@@ -105,13 +105,13 @@ def _apart(symbols: Sequence[Symbol], chosen: str) -> list[Symbol]:
 
 
 def _short(name: str) -> str:
-    """v1_003 → 3; a name without a number stays."""
+    """Shorten a name: v1_003 → 3; a name without a number stays."""
     number = re.search(r"(\d+)$", name)
     return number.group(1).lstrip("0") if number and not re.search(r"t\d+[+-]\d+$", name) else name
 
 
 def _above(point: Vector, origin: Vector, approach: Vector) -> tuple[float, float]:
-    """Metres to the right and down the page of a point seen from above, the robot below."""
+    """Return metres to the right and down the page of a point seen from above, the robot below."""
     x, y = point[0] - origin[0], point[1] - origin[1]
     side = (-approach[1], approach[0])  # up × approach
     return x * side[0] + y * side[1], x * approach[0] + y * approach[1]

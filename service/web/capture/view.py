@@ -71,8 +71,8 @@ class StepViewpoint:
     name: str
     station: str
     state: ViewState
-    why: str  # of a failure, of being left out
-    position_m: Vector | None  # of the camera in the base frame of its station
+    why: str  # reason of a failure, or of being left out
+    position_m: Vector | None  # the camera's position in the base frame of its station
     looks: Vector | None  # its optical axis there
     capture: Capture | None  # the valid one
     replaced: int  # captures that no longer count
@@ -91,17 +91,17 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class ViewpointRedo:
-    """Whether a viewpoint may be redone now, from where the run is, and whether the robot drives there at once."""
+    """The possibility to redo a viewpoint now, from where the run is, and whether the robot drives there at once."""
 
     refused: str
     current: str  # step
-    attempt: int  # of the current step
+    attempt: int  # attempt of the current step
     moves: bool
     paused: bool
 
 
 def capture_steps(protocol: Protocol) -> list[Step]:
-    """The steps that take images with the robot."""
+    """Return the steps that take images with the robot."""
     return [
         step
         for step in protocol.steps
@@ -110,7 +110,7 @@ def capture_steps(protocol: Protocol) -> list[Step]:
 
 
 def views_of(log: RunRecord, step: Step) -> list[StepViewpoint]:
-    """Every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
+    """Return every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
     state = log.state.steps[step.id]
     planned = {v.name: v for v in planned_viewpoints(log, step)}
     refused = _refused(state)
@@ -184,14 +184,14 @@ def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[No
 
 
 def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
-    """Sharp, exposed, spheres, pose, settings: in words, with the figures behind them."""
+    """List the verdicts on an image, with their figures: sharp, exposed, spheres, pose, settings."""
     of_board = capture.payload.artefacts[0].kind == "board_image"
     found = [_board(log, step, capture)] if of_board else looked_at(capture.live, [o.live for o in others])
     return [*found, *_taken(log.protocol, capture)]
 
 
 def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
-    """Whether the calibration uses an image of the board."""
+    """Return the verdict on whether the calibration uses an image of the board."""
     use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
     answer = calibration_in(log.state.steps[step.id])
     intrinsics = None if answer is None else answer.details.intrinsics
@@ -204,7 +204,7 @@ def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
 def looked_at(
     live: JobState | None, others: Sequence[JobState | None], fewest: int = FEWEST_SPHERES
 ) -> list[Verdict]:
-    """What the job says that looked at an image; `others`: those of the same camera's images."""
+    """List what the job that looked at an image says; `others` are the jobs of the same camera's images."""
     measures = {} if live is None else dict(live.measures)
     waiting = live is not None and live.status == "enqueued"
     unknown = "being looked at" if waiting else "not measured"
@@ -240,7 +240,7 @@ def looked_at(
 
 
 def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
-    """What was judged when the image was taken."""
+    """List the verdicts on an image when it was taken."""
     payload = capture.payload
     out: list[Verdict] = []
     if isinstance(payload, ViewpointCaptured):
@@ -262,7 +262,7 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
 
 
 def settings_verdict(camera: StatedCamera, passed: bool | None, limit: str = "") -> Verdict:
-    """Whether a photograph was taken with the settings that it should have."""
+    """Return the verdict on whether a photograph was taken with the settings that it should have."""
     words = {None: "not judged", True: "As wanted", False: "Differ"}
     figures = _settings(camera.aperture_f, camera.exposure_s, camera.iso)
     return Verdict("Settings", passed, words[passed], figures, limit)
@@ -284,7 +284,7 @@ def _settings(aperture_f: float | None, exposure_s: float | None, iso: float | N
 
 
 def summary_of(step: Step, capture: Capture) -> list[Verdict]:
-    """What all images up to this one come to, against the step's gates where it has any."""
+    """List what all images up to this one come to, against the step's gates where it has any."""
     measures = {} if capture.live is None else dict(capture.live.measures)
     out: list[Verdict] = []
     for measure, name, unit, factor, digits in (
@@ -307,7 +307,7 @@ def summary_of(step: Step, capture: Capture) -> list[Verdict]:
 
 
 def redo_of(log: RunRecord, step: Step, view: StepViewpoint, account: str) -> ViewpointRedo:
-    """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
+    """Return whether a viewpoint may be redone now. While the step runs, the robot then drives there by itself."""
     action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
     refusal = refuse(log.protocol, log.state, action, account)
     return ViewpointRedo(
@@ -340,10 +340,10 @@ class CameraImage:
 
     Attributes:
         device: name of a further camera in rig.yaml; "" for the first one.
-        place: where the camera is, in words.
-        sha256: of the photograph.
-        width, height: of the photograph as it states them.
-        verdicts: of this image.
+        place: a text on where the camera is.
+        sha256: hash of the photograph.
+        width, height: size of the photograph as it states it, px.
+        verdicts: the verdicts on this image.
     """
 
     device: str
@@ -375,12 +375,12 @@ class SheetImage:
 def camera_images(
     log: RunRecord, capture: Capture, verdicts: Sequence[Verdict], others: Sequence[Capture]
 ) -> list[CameraImage]:
-    """The images of all cameras at the viewpoint of a capture, the first camera's first.
+    """Return the images of all cameras at the viewpoint of a capture, the first camera's first.
 
     Args:
-        log: of the run.
-        capture: of the viewpoint.
-        verdicts: of the first camera's image.
+        log: the run's record.
+        capture: the viewpoint's capture.
+        verdicts: the verdicts on the first camera's image.
         others: valid captures of the step, whose images each camera's is compared with.
     """
     size = stated_camera(capture.payload)
@@ -396,7 +396,7 @@ def camera_images(
 
 
 def devices_in(log: RunRecord, captures: Sequence[Capture]) -> list[str]:
-    """The further cameras that took any of these images."""
+    """Return the further cameras that took any of these images."""
     return list(_by_device(log, captures))
 
 
@@ -409,7 +409,7 @@ def _by_device(log: RunRecord, captures: Sequence[Capture]) -> dict[str, list[Fu
 
 
 def sheet_image(log: RunRecord, capture: Capture, uses: Mapping[str, BoardUse], device: str) -> SheetImage | None:
-    """A capture as the contact sheet shows it; None if this further camera did not expose there."""
+    """Return a capture as the contact sheet shows it; None if this further camera did not expose there."""
     if device:
         mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
         return None if mine is None else _of_further(capture, mine)
@@ -430,7 +430,7 @@ def _of_further(capture: Capture, mine: FurtherCapture) -> SheetImage:
 
 
 def _word(capture: Capture, use: BoardUse | None) -> tuple[str, str, str]:
-    """Word, tone and reason for an image of the first camera."""
+    """Return the word, tone and reason for an image of the first camera."""
     if capture.replaced is not None:
         return "Replaced", "quiet", capture.replaced.reason
     if use is not None:

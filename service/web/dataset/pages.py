@@ -35,9 +35,9 @@ class Benchmark:
     """The results that belong to a run: those on one of the data sets that it has exported.
 
     Attributes:
-        results: by method, dense before sparse.
+        results: the results by method, dense before sparse.
         best: smallest Chamfer distance of each scenario, mm.
-        problem: why they cannot be read; "".
+        problem: why they cannot be read; "" if they can.
     """
 
     results: tuple[BenchmarkResult, ...]
@@ -46,7 +46,7 @@ class Benchmark:
 
 
 def benchmark_of(data: Path, events: Sequence[Event]) -> Benchmark:
-    """The results in DIR/benchmark whose data set has the list of checksums that the run has recorded."""
+    """Return the results in DIR/benchmark whose data set has the list of checksums that the run has recorded."""
     exported = {e.payload.sha256 for e in events if isinstance(e.payload, EvidenceExported)}
     try:
         found = read_results(data / FOLDER) if exported else ()
@@ -75,14 +75,14 @@ class Previews:
         self._children = ChildProcesses("service.web.dataset.process", "preview", clock)
 
     def ready(self, state: RunState) -> Preview | None:
-        """What is ready of a completed run's preview. Begins to make it where nobody has; None: nothing is ready."""
+        """Return what is ready of a completed run's preview, None if nothing is; start to make it if nobody did."""
         found = read_preview(self._folder(state))
         if (found is None or not found.whole) and self._children.state(state.run_id) is None:
             self.make(state)
         return found
 
     def making(self, run_id: str) -> ChildState | None:
-        """The progress or the outcome of making the preview; None before the first time."""
+        """Return the progress or the outcome of making the preview; None before the first time."""
         return self._children.state(run_id)
 
     def make(self, state: RunState) -> None:
@@ -95,7 +95,7 @@ class Previews:
         self._children.wait(run_id, timeout_s)
 
     def file(self, state: RunState, name: str) -> Path | None:
-        """A file of the preview; None for a name that it does not have."""
+        """Return a file of the preview; None for a name that it does not have."""
         path = self._folder(state) / name
         return path if FILE_NAME.fullmatch(name) and path.is_file() else None
 
@@ -136,18 +136,18 @@ class SplitTab:
 
 @dataclass(frozen=True, slots=True)
 class DataSetView:
-    """The page.
+    """The data that the page shows.
 
     Attributes:
-        views: of the chosen split.
+        views: the views of the chosen split.
         split: the chosen one.
-        splits: all.
+        splits: all splits.
         chosen: the view that is enlarged; None: there is none yet.
         before, after: names of its neighbours in the split; "" at the ends.
         done: views whose pictures are ready.
-        total: of all views.
-        crops: of the views of the split.
-        covered: (at least so many views, share of the surface).
+        total: number of all views.
+        crops: number of crops of the views of the split.
+        covered: pairs (number of views, share of the surface that at least so many views see).
     """
 
     views: tuple[ViewPreview, ...]
@@ -163,7 +163,7 @@ class DataSetView:
 
 
 def data_set_view(preview: Preview, split: str, view: str) -> DataSetView:
-    """The page for a chosen split and view; the first of the split if the name is none of its views."""
+    """Return the page for a chosen split and view; the first of the split if the name is none of its views."""
     members = tuple(shown for shown in preview.views if split in shown.splits)
     names = [shown.name for shown in members]
     at = names.index(view) if view in names else 0
@@ -207,7 +207,7 @@ def data_set_page(
     split: Split = "dense",
     view: Annotated[str, Query(max_length=200)] = "",
 ) -> Response:
-    """Views, crops, depth, coverage and distances, as far as they are ready; the rest is made meanwhile."""
+    """Show views, crops, depth, coverage and distances, as far as they are ready; the rest is made meanwhile."""
     log = site.run(run_id)
     unfit = refuse_data_set(log.state)
     preview = None if unfit else previews.ready(log.state)
@@ -241,7 +241,7 @@ def make_preview(site: CurrentSite, previews: CurrentPreviews, run_id: RunId) ->
 def picture(
     site: CurrentSite, previews: CurrentPreviews, run_id: RunId, name: Annotated[str, UrlPath(max_length=80)]
 ) -> FileResponse:
-    """A picture of the preview."""
+    """Serve a picture of the preview."""
     path = previews.file(site.run(run_id).state, name)
     if path is None or path.suffix[1:] not in _TYPES:
         raise HTTPException(404, "the data set has no such picture")
@@ -258,7 +258,7 @@ def surface_frame(
     figure: Literal["coverage", "sources", "sigmas", "distances"],
     theme: Theme = "auto",
 ) -> HTMLResponse:
-    """A coloured surface alone, for its sandboxed frame."""
+    """Show a coloured surface alone, for its sandboxed frame."""
     path = previews.file(site.run(run_id).state, f"{figure}.json")
     if path is None:
         raise HTTPException(404, "this surface is not ready")

@@ -31,7 +31,7 @@ Parts = Annotated[str, part_names("way", "image", "plan", "overlay")]
 
 @dataclass(frozen=True, slots=True)
 class HandheldPage:
-    """What the page shows; `step` and `now` are None in a protocol without images by hand."""
+    """The data that the page shows; `step` and `now` are None in a protocol without images by hand."""
 
     run_id: str
     log: RunRecord
@@ -40,12 +40,12 @@ class HandheldPage:
     now: HandheldView | None
     attempt: int
     in_control: bool
-    size: float  # of the drawing of the hemisphere
+    size: float  # size of the drawing of the hemisphere
 
 
 @router.get("/runs/{run_id}/held", name="held", dependencies=[Depends(requires("read"))])
 def held(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "") -> HTMLResponse:
-    """The page that a technician has beside the camera."""
+    """Show the page that a technician has beside the camera."""
     shown = _shown(site, person, run_id, step)
     return render(request, "handheld/handheld.html.j2", shown, frame=run_frame(site, run_id))
 
@@ -54,7 +54,7 @@ def held(request: Request, site: CurrentSite, person: SignedInPerson, run_id: Ru
 def held_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
-    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
+    """Show parts of the page, all from the same moment, for the script that keeps the page up to date."""
     return render(request, "handheld/parts.html.j2", _shown(site, person, run_id, step), names=names.split(","))
 
 

@@ -44,7 +44,7 @@ class PlanMarker:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Over the live view, in a frame of 150 × 100: which way the camera goes in the picture, and nearer or away."""
+    """The marks over the live view, in a frame of 150 × 100: the camera's way in the picture, and nearer or away."""
 
     arrow: tuple[float, float] | None  # tip, from the middle
     nearer_m: float  # positive: towards the scene
@@ -68,7 +68,7 @@ class HandheldView:
     step: Step
     running: bool
     words: str
-    failures: tuple[str, ...]  # of work on the images: what failed, what to do
+    failures: tuple[str, ...]  # failures of work on the images: what failed, what to do
     photographs_from: str  # folder of a camera without a cable; "" for one that can be released from here
     overlay: Overlay | None
     spots: tuple[PlanMarker, ...]
@@ -78,7 +78,7 @@ class HandheldView:
 
 
 def held_steps(protocol: Protocol) -> list[Step]:
-    """The steps in which a person holds the camera."""
+    """Return the steps in which a person holds the camera."""
     return [step for step in protocol.steps if step.by_hand]
 
 
@@ -133,7 +133,7 @@ def _overlay(here: Matrix, there: Matrix) -> Overlay:
 
 
 def _lowest(places: Sequence[hand_view.PlaceStatus]) -> float:
-    """Largest distance of a place from the vertical through the middle, metres."""
+    """Return the largest distance of a place from the vertical through the middle, metres."""
     radii = [math.hypot(p.T_level_camera[0][3], p.T_level_camera[1][3]) for p in places]
     return max([0.05, *radii])
 

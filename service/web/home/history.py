@@ -63,12 +63,12 @@ class TimeChart:
 def time_chart(
     points: Sequence[TimePoint], *, title: str, unit: str, from_zero: bool = True, limit: float | None = None
 ) -> TimeChart | None:
-    """A chart of points in order of time; None if there are no points.
+    """Return a chart of points in order of time; None if there are no points.
 
     Args:
-        points: oldest first.
-        title: of the chart.
-        unit: of the values.
+        points: the points, oldest first.
+        title: the chart's title.
+        unit: the values' unit.
         from_zero: the axis begins at zero; otherwise it spans the values.
         limit: the largest value that the protocol allows; None if it sets no limit.
     """
@@ -115,7 +115,7 @@ def _mark_words(point: TimePoint, unit: str) -> str:
 
 
 def _lines(marks: Sequence[TimeMark]) -> tuple[str, ...]:
-    """SVG paths through the marks of real rigs and of simulated ones, where there is more than one."""
+    """Return SVG paths through the marks of real rigs and of simulated ones, where there is more than one."""
     groups = ([mark for mark in marks if mark.simulated == simulated] for simulated in (False, True))
     return tuple("M" + "L".join(f"{mark.x} {mark.y}" for mark in group) for group in groups if len(group) > 1)
 
@@ -132,7 +132,7 @@ def _range(values: Sequence[float], limit: float | None, *, from_zero: bool) -> 
 
 
 def _days(first: float, last: float) -> list[tuple[float, str]]:
-    """Up to five times on whole hours, days, or multiples of them, in UTC."""
+    """Return up to five times on whole hours, days, or multiples of them, in UTC."""
     steps = (
         900.0,
         3600.0,
@@ -152,7 +152,7 @@ def _days(first: float, last: float) -> list[tuple[float, str]]:
 
 
 def _nice(value: float) -> float:
-    """The smallest of 1, 2, 5 × 10ⁿ that is not below a value."""
+    """Return the smallest of 1, 2, 5 × 10ⁿ that is not below a value."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(k * power for k in (1, 2, 5, 10) if k * power >= value * 0.9999999)
 
@@ -175,7 +175,7 @@ class InstrumentHistory:
 def history_page(
     request: Request, site: CurrentSite, rigs: Annotated[str, Query(pattern="^(|real|simulated)$")] = ""
 ) -> HTMLResponse:
-    """Every instrument that took part in a run with figures; of all rigs, the real or the simulated ones."""
+    """Show every instrument that took part in a run with figures; of all rigs, the real or the simulated ones."""
     rows = [row for row in history(site.store) if not rigs or row.run.simulated == (rigs == "simulated")]
     courses = [_course(instrument, mine) for instrument, mine in by_instrument(rows).items()]
     return render(request, "home/history.html.j2", courses=courses, rigs=rigs, count=len(rows))
@@ -183,7 +183,7 @@ def history_page(
 
 @router.get("/history.csv", name="history_csv", dependencies=_READ)
 def history_file(site: CurrentSite) -> Response:
-    """All rows as CSV."""
+    """Show all rows as CSV."""
     name = f"orthocapture-history-{site.store.clock.utc_now():%Y%m%d}.csv"
     return Response(
         history_csv(history(site.store)),

@@ -50,20 +50,20 @@ class RunLine:
     robot: str
     standing: tuple[str, str] = ("Under way", "now")  # how it stands, and the tone of it
     why: str = ""  # it is stopped, and what is recommended
-    fault: str = ""  # what is wrong with its record
+    fault: str = ""  # the fault of its record
     about: RunAbout = field(default_factory=RunAbout)
 
 
 @dataclass(frozen=True, slots=True)
 class StartableProtocol:
-    """A protocol file."""
+    """A protocol file that can be started."""
 
     file: str
     loaded: LoadedProtocol | None
     fault: str = ""
     space: str = ""  # why the disk will not do for it
     standing: ProtocolStanding | None = None
-    changes: tuple[str, ...] = ()  # against the approved content of its id and version
+    changes: tuple[str, ...] = ()  # changes against the approved content of its id and version
 
 
 class HomeQuery(BaseModel):
@@ -76,7 +76,7 @@ class HomeQuery(BaseModel):
     result: str = Field("", max_length=200)
 
     def wanted(self) -> RunSearch:
-        """The search."""
+        """Return the search."""
         return RunSearch(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
 
 
@@ -87,7 +87,7 @@ def home(
     person: SignedInPerson,
     asked_for: Annotated[HomeQuery, Query()],
 ) -> HTMLResponse:
-    """The runs in progress, then those that have ended, newest first, or those that match a search.
+    """Show the runs in progress, then those that have ended, newest first, or those that match a search.
 
     Only the runs of the page shown are read whole.
     """
@@ -118,7 +118,7 @@ def home(
 
 @router.get("/robots", name="robots", dependencies=[Depends(requires("read"))])
 def robots(request: Request, site: CurrentSite, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
-    """The state of all robots that are being driven, for the script that keeps every page up to date."""
+    """Show the state of all robots that are being driven, for the script that keeps every page up to date."""
     return render(request, "page/robots.html.j2", others=driven_frames(site, but=but))
 
 
@@ -133,7 +133,7 @@ def theme(
     theme: Annotated[Literal["light", "dark", "auto"], Form()],
     back: Annotated[str, Form(max_length=400)] = "/",
 ) -> RedirectResponse:
-    """Light or dark on this screen, remembered by its browser."""
+    """Switch to light or dark on this screen; its browser remembers it."""
     # Only pages of this site: neither //elsewhere nor /\elsewhere.
     inside = back.startswith("/") and not back.startswith(("//", "/\\"))
     response = RedirectResponse(back if inside else "/", status_code=303)
@@ -142,7 +142,7 @@ def theme(
 
 
 def _in_order(site: Site, found: Collection[str]) -> list[RunRow]:
-    """The found runs: first those that a process drives, then other open ones, then ended ones, each newest first."""
+    """Return the found runs: those that a process drives, then open ones, then ended ones, each newest first."""
     driven = set(site.launcher.driven_runs())
     under_way = site.store.open_runs() | driven
     newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]
@@ -210,7 +210,7 @@ _KNOWN = 20  # entries of earlier runs that a field offers
 def start_form(
     request: Request, site: CurrentSite, person: SignedInPerson, protocol: Annotated[str, Query(max_length=200)]
 ) -> HTMLResponse:
-    """Fields of a new run of one protocol file; the site is filled in as in the run before."""
+    """Show fields of a new run of one protocol file; the site is filled in as in the run before."""
     if protocol not in {path.name for path in site.protocol_files()}:
         raise ConfigurationError(
             f"there is no protocol file {protocol!r}",
@@ -232,7 +232,7 @@ def start_form(
 
 
 def _known(earlier: list[RunAbout], field: str) -> list[str]:
-    """What was entered before, newest first, each once."""
+    """Return what was entered before, newest first, each once."""
     return list(dict.fromkeys(value for about in earlier if (value := str(getattr(about, field)))))[:_KNOWN]
 
 
@@ -285,7 +285,7 @@ _OFFERED = 200  # runs to choose from
 def compare_page(
     request: Request, site: CurrentSite, run: Annotated[list[str] | None, Query(max_length=64)] = None
 ) -> HTMLResponse:
-    """Two runs, or the choice of two. Raises UnknownRunError."""
+    """Show two runs, or the choice of two. Raises UnknownRunError."""
     chosen = list(dict.fromkeys(run or []))
     comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]

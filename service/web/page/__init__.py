@@ -1,1 +1,1 @@
-"""What all pages share: rendering, the frame around a run, words, charts and errors."""
+"""What all pages share: rendering, the frame around a run, texts, charts and errors."""

@@ -47,7 +47,7 @@ class HeatMap:
 
 @dataclass(frozen=True, slots=True)
 class Arrow:
-    """From one place to another."""
+    """An arrow from one place to another."""
 
     x1: float
     y1: float
@@ -79,7 +79,7 @@ class ChartPoint:
 
 @dataclass(frozen=True, slots=True)
 class DotPlot:
-    """Values of several series for each name, along the x axis; told apart by shape."""
+    """Values of several series for each name, along the x axis; the series differ in shape."""
 
     title: str
     height: float
@@ -101,12 +101,12 @@ def heat_map(
     logarithmic: bool = False,
     every: int = 1,
 ) -> HeatMap:
-    """Values (rows, columns) over an image of a width and height in pixels.
+    """Draw values (rows, columns) over an image of a width and height in pixels.
 
     Args:
-        digits: after the point of the numbers in the cells.
+        digits: digits after the point of the numbers in the cells.
         logarithmic: shades go by the logarithm; for values above zero that span decades.
-        every: the number of every so many-th cell is written.
+        every: write the number in one of this many cells, along rows and columns.
     """
     rows, columns = len(values), len(values[0])
     width = WIDTH - _LEFT - _RIGHT
@@ -146,7 +146,7 @@ def vector_field(
     title: str,
     least: int = 5,
 ) -> VectorField:
-    """Vectors (rows, columns, 2) in px, exaggerated so that the longest fills a cell; cells with few are left out."""
+    """Return vectors (rows, columns, 2) in px, scaled so that the longest fills a cell, without cells of few."""
     rows, columns = len(vectors), len(vectors[0])
     width = WIDTH - _LEFT - _RIGHT
     inner = width * image_px[1] / image_px[0]
@@ -175,7 +175,7 @@ def dots(
     limit: float | None = None,
     limit_text: str = "",
 ) -> DotPlot:
-    """A dot plot with one mark for each name and series. A limit far above all values is stated, not drawn."""
+    """Return a dot plot with one mark for each name and series. A limit far above all values is named, not drawn."""
     height = 300.0
     inner = height - _TOP - _BOTTOM
     known = [v for _, values in series for v in values if v is not None]
@@ -214,7 +214,7 @@ def _pixel_ticks(image_px: tuple[int, int], inner: float) -> tuple[tuple[Tick, .
 
 
 def _nice(value: float) -> float:
-    """The largest of 1, 2, 5 × 10ⁿ that is not above a value."""
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a value."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -57,13 +57,13 @@ TEMPLATES = Environment(
 
 
 def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
-    """How many events from `start` on keep files for the same step."""
+    """Return how many events from `start` on keep files for the same step."""
     first = rows[start]
     return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
 
 
 def entered_of(root: EventRow) -> list[tuple[str, str]]:
-    """What was entered when a run began, read from its first event in the database."""
+    """Return what was entered when a run began, from its first event in the database."""
     try:
         return about_rows(RunAbout.model_validate(root.payload.get("about") or {}))
     except ValidationError:  # altered: the verification says so
@@ -76,7 +76,7 @@ TEMPLATES.filters["local_time"] = local_time
 
 
 def part_names(*names: str) -> Any:
-    """Path parameter that names one or more of a page's parts, between commas."""
+    """Return the path parameter that names one or more of a page's parts, between commas."""
     one = f"({'|'.join(names)})"
     return Path(pattern=f"^{one}(,{one}){{0,{len(names) - 1}}}$")
 
@@ -84,13 +84,13 @@ def part_names(*names: str) -> Any:
 def render(
     request: Request, template: str, shown: DataclassInstance | None = None, /, *, status: int = 200, **more: object
 ) -> HTMLResponse:
-    """A page, or a part of one.
+    """Render a page, or a part of one.
 
     Args:
-        request: whose `person` is who is signed in, or None on the few public pages.
-        template: `run/run.html.j2` is service/web/run/templates/run.html.j2.
+        request: the request; its `person` is who is signed in, or None on the few public pages.
+        template: the template's path; `run/run.html.j2` is service/web/run/templates/run.html.j2.
         shown: record of what the page shows; the template has its fields as variables.
-        status: of the response.
+        status: the status of the response.
         more: further variables of the template.
     """
     own: Mapping[str, object] = {} if shown is None else {f.name: getattr(shown, f.name) for f in fields(shown)}
@@ -148,7 +148,7 @@ class PageProblem:
 
 
 def status_of(error: OrthocaptureError) -> int:
-    """The HTTP status that an error means."""
+    """Return the HTTP status that an error means."""
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 409)
 
 
@@ -161,13 +161,13 @@ def install_errors(app: FastAPI) -> None:
 
 
 def wants_json(request: Request) -> bool:
-    """Whether the client reads JSON rather than pages."""
+    """Return whether the client reads JSON rather than pages."""
     accepted = request.headers.get("accept", "")
     return "application/json" in accepted and "text/html" not in accepted
 
 
 def respond(request: Request, problem: PageProblem, headers: dict[str, str] | None = None) -> Response:
-    """A problem as page or as JSON."""
+    """Return a problem as page or as JSON."""
     if wants_json(request):
         return JSONResponse(asdict(problem), status_code=problem.status, headers=headers)
     _recognise(request)
@@ -177,7 +177,7 @@ def respond(request: Request, problem: PageProblem, headers: dict[str, str] | No
 
 
 def _recognise(request: Request) -> None:
-    """Who looks at the page of an error that came before any guard, such as an address that does not exist."""
+    """Recognise who looks at the page of an error that came before any guard, such as an unknown address."""
     site = request.app.state.site
     if hasattr(request.state, "person"):
         return

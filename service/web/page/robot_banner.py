@@ -29,16 +29,16 @@ class LookAt:
 
 @dataclass(frozen=True, slots=True)
 class Banner:
-    """The state of the robot, in words."""
+    """The state of the robot as text."""
 
     key: str  # moving, standing, paused, pausing, protective_stop …
     tone: Tone
     icon: str
     title: str
     text: str
-    remedy: str = ""  # what a person does at the robot
+    remedy: str = ""  # the thing that a person does at the robot
     assertive: bool = False  # screen readers interrupt for it
-    look: tuple[LookAt, ...] = ()  # what a person can say here to have looked at
+    look: tuple[LookAt, ...] = ()  # the losses that a person can say here to have looked at
 
 
 LOST = Banner(
@@ -51,14 +51,14 @@ LOST = Banner(
 
 
 def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, driven: bool, tries: str = "") -> Banner:
-    """What to say of the robot; what is not known for certain is shown as unknown.
+    """Return what to say of the robot; what is not known for certain is shown as unknown.
 
     Args:
-        state: of the run.
-        snapshot: the last word of the program that drives it.
+        state: the run's state.
+        snapshot: the last report of the program that drives it.
         now_utc_s: now, in seconds since the epoch.
-        driven: whether that program runs.
-        tries: what failed and is tried again by itself, in words; "" for nothing.
+        driven: true if that program runs.
+        tries: a text on what failed and is tried again by itself; "" for nothing.
     """
     lost = lost_arms(state)
     banner = _present(state, snapshot, now_utc_s, tries, driven=driven)
@@ -75,7 +75,7 @@ def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, drive
 
 
 def _joined(*sentences: str) -> str:
-    """Sentences one after the other, without those that are ""."""
+    """Return sentences one after the other, without those that are ""."""
     return " ".join(filter(None, sentences))
 
 
@@ -84,7 +84,7 @@ def _ended(state: RunState) -> str:
 
 
 def _now(snapshot: Snapshot) -> str:
-    """What the program does now, if it takes long."""
+    """Return what the program does now, if it takes long."""
     busy = busy_words(snapshot)
     return f"Now: {busy}." if busy else ""
 
@@ -101,7 +101,7 @@ def _loss_words(name: str, loss: Loss) -> str:
 def _present(  # noqa: PLR0911 - one return a case
     state: RunState, snapshot: Snapshot, now_utc_s: float, tries: str, *, driven: bool
 ) -> Banner:
-    """What to say of the robot as if every loss of a connection had been seen to."""
+    """Return what to say of the robot as if every loss of a connection had been seen to."""
     if snapshot.doing in ("unknown", "ended") and not driven and connected_arms(state) and _left(state, snapshot):
         return _left_alone(state, snapshot)
     if state.terminal:
@@ -136,7 +136,7 @@ def _present(  # noqa: PLR0911 - one return a case
 
 
 def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
-    """No arm is connected: never yet, not any more, or because it could not be."""
+    """Return the banner while no arm is connected: never yet, not any more, or because it could not be."""
     title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
     if connected_arms(state):
         text = f"It was connected, and is being connected again. Take it as moving. {NOT_THE_STOP}"
@@ -154,12 +154,12 @@ def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
 
 
 def _left(state: RunState, snapshot: Snapshot) -> bool:
-    """Whether the program that drove the run ended without closing its connections in an orderly way at the end."""
+    """Return whether the program that drove the run ended without closing its connections in an orderly way."""
     return not state.terminal or (snapshot.doing == "unknown" and snapshot.at_utc_s > 0)
 
 
 def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
-    """The program ended while arms were connected; that is not in the record before it starts again."""
+    """Return the banner if the program ended while arms were connected, which the record shows only later."""
     arms = connected_arms(state)
     at_utc = datetime.fromtimestamp(snapshot.at_utc_s, UTC).isoformat() if snapshot.at_utc_s else state.at_utc
     told = (
@@ -172,7 +172,7 @@ def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
 
 
 def busy_words(snapshot: Snapshot) -> str:
-    """What the program is doing, and for how long; "" if it does not take long.
+    """Return what the program is doing, and for how long; "" if it does not take long.
 
     A call without a description of its own is described by the work it belongs to, so that a hang is visible.
     """
@@ -185,7 +185,7 @@ def busy_words(snapshot: Snapshot) -> str:
 
 
 def _starved(snapshot: Snapshot) -> str:
-    """That the computer is too busy, where that is a good part of the time."""
+    """Say that the computer is too busy, where that is a good part of the time."""
     if snapshot.starved_s < max(1.0, 0.2 * snapshot.quiet_s):
         return ""
     return f", of which it waited {snapshot.starved_s:.0f} s for a processor"

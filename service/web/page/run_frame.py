@@ -1,4 +1,4 @@
-"""The frame of every page of a run: its name and navigation, how it stands, and the words that pages share."""
+"""The frame of every page of a run: its name and navigation, how it stands, and the texts that pages share."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def drawing_of(step: Step) -> str:
 
 
 def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
-    """Return the limits in words: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
+    """Return the limits as text: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
     if minimum is not None and minimum == maximum:
         return f"exactly {minimum:g} {unit}".rstrip()
     low = "" if minimum is None else f"at least {minimum:g}"
@@ -51,17 +51,17 @@ def sentence(text: str) -> str:
 
 
 def station_of(step: Step) -> str:
-    """`station 1` of a capture step; "" for others."""
+    """Return the station of a capture step as `station 1`; "" for other steps."""
     return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in planned_sets(step)))
 
 
 def count(amount: int, one: str, many: str = "") -> str:
-    """`1 image`, `8 images`."""
+    """Return a number of images as `1 image`, `8 images`."""
     return f"{amount} {one if amount == 1 else many or one + 's'}"
 
 
 def will_happen(step: Step, now: StepState) -> tuple[str, str]:
-    """What a confirmation of this step does: the large words of its button, and a line below."""
+    """Return what a confirmation of this step does: the large text of its button, and a line below."""
     kind = step_kinds().get(step.kind)
     left = max(planned_views(step) - len(now.captured), 0)
     before = BeforeStep(step.title, left, station_of(step))
@@ -74,21 +74,21 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:
 
 
 def figure_line(verdict: GateVerdict) -> str:
-    """One figure of what is signed or did not pass."""
+    """Return one figure of what is signed or did not pass."""
     allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)
     undecided = "; not decided" if verdict.undecided else ""
     return f"{measure_name(verdict.measure)} {figure(verdict)} ({allowed}{undecided})"
 
 
 def needs(verdict: GateVerdict) -> str:
-    """What a gate lacks: `Coverage 0.896, needs at least 0.9`."""
+    """Return what a gate needs: `Coverage 0.896, needs at least 0.9`."""
     allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)
     undecided = ", not decided" if verdict.undecided else ""
     return f"{measure_name(verdict.measure)} {figure(verdict)}, needs {allowed}{undecided}"
 
 
 def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) -> str:
-    """Why a run is stopped and what is recommended: `Coverage 0.896, needs at least 0.9 → take these 6 views`."""
+    """Say why a run is stopped and what is recommended: `Coverage 0.896, needs at least 0.9 → take these 6 views`."""
     now = state.step
     failed = [needs(verdict) for verdict in now.verdicts if not verdict.passed]
     if now.failure is not None:
@@ -100,7 +100,7 @@ def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) ->
 
 
 def way_words(state: RunState, way: WayOn) -> str:
-    """A way on in few words, with a small letter: the views that mend are counted, an advice is cut at its end."""
+    """Describe a way on in few words, with a small letter: mending views are counted, an advice is cut at its end."""
     mends = state.step.mend or Mending()
     views = len(mends.viewpoints)
     if way.verb == "confirm" and views:
@@ -121,12 +121,12 @@ _STANDINGS: dict[GateStanding, tuple[str, str]] = {
 
 
 def gate_word(verdict: GateVerdict, *, accepted: bool = False) -> tuple[str, str]:
-    """The outcome of a gate as a word and its tone. `accepted`: a person accepted the figures outside the limits."""
+    """Return a gate's outcome as a word and its tone. `accepted`: a person accepted figures outside the limits."""
     return _STANDINGS[standing(verdict, accepted=accepted)]
 
 
 def phase_words(state: RunState, step: StepState, *, stopped: bool = False) -> tuple[str, str, str]:
-    """A step's status in the list of steps: word, tone, icon. `stopped`: the current one needs a decision."""
+    """Return a step's status in the list of steps: word, tone, icon. `stopped`: the current one needs a decision."""
     if step.skipped:
         return "skipped", "skipped", "skip"
     if step.phase == "passed" and step.accepted is not None:
@@ -145,17 +145,17 @@ Mode = Literal["ask", "sign", "more", "recover", "work", "paused", "died", "ende
 
 @dataclass(frozen=True, slots=True)
 class RunStanding:
-    """How a run stands now.
+    """The present standing of a run.
 
     Attributes:
-        mode: what it does or waits for.
-        decision: what the machine would do next.
-        key: the same for a tower, and for screens that are told of other runs.
-        word: in one or two words.
-        tone: of that word.
-        why: what stops it or is asked for, without a full stop; "" for nothing.
-        alert: what a screen that looks elsewhere is told; "" while it works.
-        headline: what a screen that looks at it is told.
+        mode: the thing that it does or waits for.
+        decision: the decision of what the machine would do next.
+        key: the standing for a signal tower, and for screens that show other runs.
+        word: the standing in one or two words.
+        tone: the tone of that word.
+        why: the thing that stops it or is asked for, without a full stop; "" for nothing.
+        alert: the message for a screen that looks elsewhere; "" while it works.
+        headline: the message for a screen that looks at it.
     """
 
     mode: Mode
@@ -171,13 +171,13 @@ class RunStanding:
 def run_standing(
     protocol: Protocol, state: RunState, *, driven: bool, robot: RobotPhase = "not_connected"
 ) -> RunStanding:
-    """How a run stands, from its record alone and from who drives it; so a dead runner is noticed too.
+    """Return how a run stands, from its record alone and from who drives it; so a dead runner is noticed too.
 
     Args:
-        protocol: of the run.
-        state: of the run.
-        driven: whether a running process drives it.
-        robot: as its driver last told.
+        protocol: the run's protocol.
+        state: the run's state.
+        driven: true if a running process drives it.
+        robot: the robot's phase, as its driver last reported it.
     """
     decision, title = decide(protocol, state), protocol.step(state.current).title
     if state.terminal:
@@ -201,7 +201,7 @@ def run_standing(
 
 
 def _driven(protocol: Protocol, state: RunState, decision: Decision, title: str) -> RunStanding:
-    """How a run stands that a process drives, whose robot is not stopped."""
+    """Return how a run stands that a process drives, whose robot is not stopped."""
     if state.paused:
         told = "The run is paused."
         return RunStanding("paused", decision, "waits", "Paused", "attention", "", told, f"Paused at: {title}.")
@@ -227,7 +227,7 @@ def _driven(protocol: Protocol, state: RunState, decision: Decision, title: str)
 
 @dataclass(frozen=True, slots=True)
 class Attention:
-    """What a screen reports by sound and notification, if alerts are switched on there."""
+    """The report of a screen by sound and notification, if alerts are switched on there."""
 
     key: Standing = "works"
     words: str = ""
@@ -244,7 +244,7 @@ class Tab:
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """What base.html.j2 needs to know about a run."""
+    """The data about a run that base.html.j2 needs."""
 
     run_id: str
     name: str
@@ -259,11 +259,11 @@ class RunFrame:
     attention: Attention
     banner: Banner
     tabs: tuple[Tab, ...]
-    coats: tuple[Coat, ...] = ()  # that disappear before a scan which is still to come
+    coats: tuple[Coat, ...] = ()  # coats that disappear before a scan which is still to come
 
 
 def run_frame(site: Site, run_id: str) -> RunFrame:
-    """The frame of a run's pages. Raises UnknownRunError."""
+    """Return the frame of a run's pages. Raises UnknownRunError."""
     log = site.run(run_id)
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the run was read
@@ -300,12 +300,12 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
 
 
 def coats_of(site: Site, log: RunRecord) -> tuple[Coat, ...]:
-    """The coats of a run whose clocks run now."""
+    """Return the coats of a run whose clocks run now."""
     return coats(log.protocol, log.state, moment_of(site.store.clock))
 
 
 def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:
-    """The frames of all runs that a living process drives now, for the banners of pages that are not theirs.
+    """Return the frames of all runs that a living process drives now, for the banners of pages that are not theirs.
 
     Never raises: a run whose state cannot be read is shown as unknown.
 

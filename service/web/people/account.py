@@ -28,7 +28,7 @@ Token = Annotated[str, Path(max_length=100)]
 
 
 def own_page(address: str) -> str:
-    """An address of this site to go to, or the first page when it is anything else."""
+    """Return an address of this site to go to, or the first page when it is anything else."""
     plain = address.isascii() and address.isprintable() and "\\" not in address
     return address if plain and address.startswith("/") and not address.startswith("//") else "/"
 
@@ -55,7 +55,7 @@ def sign_in_page(
     next_page: Annotated[str, Query(alias="next", max_length=500)] = "/",
     done: Annotated[str, Query(max_length=20)] = "",
 ) -> HTMLResponse:
-    """The form to sign in with."""
+    """Show the form to sign in with."""
     return render(
         request,
         "people/sign_in.html.j2",
@@ -122,12 +122,12 @@ def sign_out(site: CurrentSite, person: SignedInPerson) -> Response:
 
 @router.get("/set-up/{token}", name="set_up_page", response_class=HTMLResponse)
 def set_up_page(request: Request, site: CurrentSite, token: Token) -> HTMLResponse:
-    """The form behind a one-time link. Looking at it does not use it up."""
+    """Show the form behind a one-time link. Looking at it does not use it up."""
     return _set_up_form(request, site, token, None)
 
 
 class SetUpForm(BaseModel):
-    """What a person chooses behind a one-time link; only the first administrator also chooses the two names."""
+    """The choices of a person behind a one-time link; only the first administrator also chooses the two names."""
 
     password: str = Field(max_length=256)
     repeated: str = Field(max_length=256)
@@ -202,7 +202,7 @@ def lock(site: CurrentSite, person: SignedInPerson, back: Back = "/") -> Respons
 
 @router.get("/unlock", name="unlock_page", dependencies=[Depends(requires("read"))], response_class=HTMLResponse)
 def unlock_page(request: Request, back: Annotated[str, Query(max_length=500)] = "/") -> HTMLResponse:
-    """The form for the PIN, for browsers without script; pages show it over themselves."""
+    """Show the form for the PIN, for browsers without script; pages show it over themselves."""
     return render(request, "people/unlock.html.j2", back=own_page(back), problem=None)
 
 
@@ -231,7 +231,7 @@ def unlock(request: Request, site: CurrentSite, person: SignedInPerson, pin: Pin
 def own_account(
     request: Request, site: CurrentSite, person: SignedInPerson, done: Annotated[str, Query(max_length=20)] = ""
 ) -> HTMLResponse:
-    """Password, PIN and screens of the person who looks."""
+    """Show password, PIN and screens of the person who looks."""
     return _own_account(request, site, person, done=done)
 
 

@@ -27,7 +27,7 @@ _ADMINISTER = [Depends(requires("administer"))]
 
 @router.get("/accounts", name="accounts", dependencies=_ADMINISTER, response_class=HTMLResponse)
 def accounts(request: Request, site: CurrentSite) -> HTMLResponse:
-    """All accounts, and the form to invite somebody."""
+    """Show all accounts, and the form to invite somebody."""
     return _list(request, site)
 
 
@@ -141,7 +141,7 @@ def reset(
 
 
 def utc_of(utc_s: float) -> str:
-    """Seconds since 1970 as the record writes times."""
+    """Return the seconds since 1970 as the record writes times."""
     return utc_text(datetime.fromtimestamp(utc_s, UTC))
 
 
@@ -211,7 +211,7 @@ _ENROL = [Depends(requires("enrol"))]
 
 @router.get("/badges", name="badges", dependencies=_ENROL, response_class=HTMLResponse)
 def badges(request: Request, site: CurrentSite) -> HTMLResponse:
-    """Who has a badge."""
+    """Show who has a badge."""
     return _badges_page(request, site)
 
 

@@ -52,12 +52,12 @@ class StatedCamera(BaseModel):
 
 
 def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
-    """What the photograph of a view states about the camera."""
+    """Return what the photograph of a view states about the camera."""
     return StatedCamera.model_validate(view.camera)
 
 
 def step_to_show(log: RunRecord, steps: Sequence[Step], wanted: str) -> Step | None:
-    """The step asked for; else the current one, the last one with images, or the first; None without any."""
+    """Return the step asked for; else the current one, the last one with images, or the first; None without any."""
     by_id = {step.id: step for step in steps}
     if wanted in by_id:
         return by_id[wanted]
@@ -72,7 +72,7 @@ class Capture:
     """One exposure in the record.
 
     Attributes:
-        replaced: by what and why, where it is no longer valid.
+        replaced: the reason and the thing that replaced it, where it is no longer valid.
         live: the job that looked at the image while the capture ran; None where there is none.
     """
 
@@ -102,7 +102,7 @@ class FurtherCapture:
 
 
 def further_of(log: RunRecord, capture: Capture) -> list[FurtherCapture]:
-    """The images of further cameras at the viewpoint of a capture."""
+    """Return the images of further cameras at the viewpoint of a capture."""
     if not isinstance(capture.payload, ViewpointCaptured) or not capture.payload.further:
         return []
     live = live_jobs(log.state.steps[capture.payload.step])
@@ -110,7 +110,7 @@ def further_of(log: RunRecord, capture: Capture) -> list[FurtherCapture]:
 
 
 def further_cameras_of(log: RunRecord) -> tuple[KnownFurtherCamera, ...]:
-    """The further cameras of a run, by its valid images."""
+    """Return the further cameras of a run, by its valid images."""
     from service.dataset.further_cameras import known_further_cameras  # noqa: PLC0415 - numpy, not needed to start
 
     seqs = sorted(seq for step in log.state.steps.values() for seq in step.captured.values())
@@ -119,7 +119,7 @@ def further_cameras_of(log: RunRecord) -> tuple[KnownFurtherCamera, ...]:
 
 
 def captures_of(log: RunRecord, step: str) -> list[Capture]:
-    """Every exposure of a step in order, including replaced ones."""
+    """Return every exposure of a step in order, including replaced ones."""
     replaced = replaced_events(log)
     live = live_jobs(log.state.steps[step])
     out: list[Capture] = []
@@ -132,13 +132,13 @@ def captures_of(log: RunRecord, step: str) -> list[Capture]:
 
 
 def valid_capture(log: RunRecord, step: str, viewpoint: str) -> Capture | None:
-    """The exposure of a viewpoint that counts now."""
+    """Return the exposure of a viewpoint that counts now."""
     seq = log.state.steps[step].captured.get(viewpoint)
     return None if seq is None else capture_at(log, seq)
 
 
 def capture_at(log: RunRecord, seq: int) -> Capture | None:
-    """The exposure that an event records; None where the event is of another kind."""
+    """Return the exposure that an event records; None where the event is of another kind."""
     if not 1 <= seq <= len(log.events):
         return None
     event = log.events[seq - 1]
@@ -151,7 +151,7 @@ def capture_at(log: RunRecord, seq: int) -> Capture | None:
 def find_capture(
     log: RunRecord, viewpoint: str, *, step: str = "", attempt: int | None = None, seq: int | None = None
 ) -> Capture | None:
-    """The exposure of a viewpoint: that of an event, the last of an attempt, or the valid one.
+    """Return the exposure of a viewpoint: that of an event, the last of an attempt, or the valid one.
 
     Without a step the last step that has it.
     """
@@ -173,7 +173,7 @@ def find_capture(
 
 
 def live_jobs(state: StepState) -> Mapping[str, JobState]:
-    """The newest job that looked at each photograph of any camera, by SHA-256, finished or not."""
+    """Return the newest job that looked at each photograph of any camera, by SHA-256, finished or not."""
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
         if job.kind in (live_view.KIND.name, further_view.KIND.name):
@@ -182,12 +182,12 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
 
 
 def replaced_events(log: RunRecord) -> Mapping[int, Superseded]:
-    """What replaced an exposure, by the number of its event."""
+    """Return what replaced an exposure, by the number of its event."""
     return {seq: past for past in log.state.superseded for seq in past.captured.values()}
 
 
 def last_failures(log: RunRecord, step: str) -> Mapping[str, str]:
-    """The message of each viewpoint's last failure in the current attempt."""
+    """Return the message of each viewpoint's last failure in the current attempt."""
     attempt = log.state.steps[step].attempt
     return {
         event.payload.viewpoint: event.payload.message
@@ -204,7 +204,7 @@ _SEARCH = re.compile(r" ?\(searched at widths [^)]*\)")  # what the detector onc
 
 @dataclass(frozen=True, slots=True)
 class BoardUse:
-    """Whether one board image is used; `used` is None while that is not known."""
+    """The use of one board image; `used` is None while that is not known."""
 
     used: bool | None
     word: str
@@ -217,7 +217,7 @@ class BoardUse:
 
 
 def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str, BoardUse]:
-    """The uses of a step's valid board images by SHA-256: from their own jobs first, later from the calibration."""
+    """Return the use of a step's valid board images by SHA-256: by their own jobs first, later by the calibration."""
     state = run.steps[step]
     images = {
         payload.artefacts[0].sha256: payload
@@ -228,12 +228,12 @@ def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str
 
 
 def calibration_in(state: StepState) -> calibrate.Answer | None:
-    """What a step has calibrated; None if its result is not there yet, or of another kind, as of imported images."""
+    """Return a step's calibration; None if it has no result yet, or one of another kind, as imported images do."""
     return calibrate.KIND.read_answer(state.result) if "camera" in state.result else None
 
 
 def board_use(state: StepState, view: RecordedView) -> BoardUse:
-    """Whether one image of a step is used."""
+    """Return whether one image of a step is used, and why."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
     looks = [job for job in state.jobs.values() if job.kind == board_view.KIND.name]
     look = next((job for job in looks if image_of(job).sha256 == sha256), None)
@@ -268,7 +268,7 @@ def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
 
 
 def _reasons(state: StepState, answer: calibrate.Answer | None) -> dict[str, str]:
-    """Reasons against using an image, by viewpoint."""
+    """Return reasons against using an image, by viewpoint."""
     why: dict[str, str] = {}
     if answer is not None:
         details, hand_eye = answer.details, answer.hand_eye
@@ -286,14 +286,14 @@ def _plain(reason: str) -> str:
 
 
 def recorded_rig_section(log: RunRecord) -> RigSection:
-    """What the rig file of the run says. Raises ConfigurationError if this version cannot read it."""
+    """Return what the rig file of the run says. Raises ConfigurationError if this version cannot read it."""
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the record was read
     return _section(log.store.artefact_path(root.rig.sha256))
 
 
 def rig_cameras(log: RunRecord) -> tuple[str, ...]:
-    """The names of its further cameras, in their order; they exist before any of them has taken an image."""
+    """Return the names of its further cameras, in their order; they exist before any of them has taken an image."""
     return tuple(recorded_rig_section(log).cameras)
 
 

@@ -39,7 +39,7 @@ class Sphere:
     label: str  # "3"; "C1" for a control sphere
     kind: SphereKind  # "sphere": not known yet whether it is a registration or a control sphere
     centre_m: tuple[float, float, float]
-    rms_mm: float | None = None  # of the surface points against the fitted sphere
+    rms_mm: float | None = None  # rms distance of the surface points from the fitted sphere
     radius_residual_mm: float | None = None
 
 
@@ -53,13 +53,13 @@ class DisplayedRegistration:
 
 
 def last_step(log: RunRecord, gives: Gives) -> str:
-    """The last step that gives this and has a result; "" if there is none."""
+    """Return the last step that gives this and has a result; "" if there is none."""
     steps = (step.id for step in reversed(log.protocol.steps) if step.gives == gives)
     return next((step for step in steps if log.state.steps[step].result), "")
 
 
 def displayed_registration(log: RunRecord) -> DisplayedRegistration | None:
-    """The registration to show; None before there is one."""
+    """Return the registration to show; None before there is one."""
     name = best_registration(log.protocol, log.state)
     if name is None:
         return None
@@ -68,7 +68,7 @@ def displayed_registration(log: RunRecord) -> DisplayedRegistration | None:
 
 
 def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:
-    """Spheres of the registered scan, and the control spheres, in its frame."""
+    """Return spheres of the registered scan, and the control spheres, in its frame."""
     scan = _found_in(log, registered_scan(log.protocol, log.state))
     if not scan.spheres_m:
         return ()
@@ -79,12 +79,12 @@ def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:
 
 
 def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
-    """All spheres of the CT, in its frame; the CT does not show which of them are removed later."""
+    """Return all spheres of the CT, in its frame; the CT does not show which of them are removed later."""
     return _numbered(_found_in(log, last_step(log, "ct_surface")), "sphere")
 
 
 def _found_in(log: RunRecord, step: str) -> SpheresFound:
-    """What a step that imports a scan or a CT found; no spheres without such a step, or before it has a result."""
+    """Return the spheres that an import of a scan or a CT found; none without such a step, or before its result."""
     result = log.state.steps[step].result if step in log.state.steps else {}
     return locate_spheres.KIND.read_answer(result) if result else SpheresFound(spheres_m=())
 
@@ -104,7 +104,7 @@ _OUTLINES_BY_VIEWPOINT = TypeAdapter(dict[str, tuple[OutlineRecord, ...]])
 
 
 class LivePose(BaseModel):
-    """Where an image was taken, as the job `live_view` found it; T_base_scan is None while it is not known."""
+    """The place where an image was taken, as the job `live_view` found it; T_base_scan is None until it is known."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -121,19 +121,19 @@ class LiveOutlines(LivePose):
 
 @lru_cache(maxsize=512)
 def read_live_pose(path: Path) -> LivePose:
-    """The pose in a file of a job `live_view`; cached, because an artefact never changes under its name."""
+    """Return the pose in a file of a job `live_view`; cached, because an artefact never changes under its name."""
     return LivePose.model_validate_json(path.read_bytes())
 
 
 @lru_cache(maxsize=8)
 def read_live_outlines(path: Path) -> LiveOutlines:
-    """A file of a job `live_view`, with its outlines."""
+    """Return a file of a job `live_view`, with its outlines."""
     return LiveOutlines.model_validate_json(path.read_bytes())
 
 
 @lru_cache(maxsize=8)
 def read_outlines(path: Path) -> Mapping[str, tuple[OutlineRecord, ...]]:
-    """A file of a job `detect_spheres`: the outlines in each image, by viewpoint."""
+    """Return a file of a job `detect_spheres`: the outlines in each image, by viewpoint."""
     return _OUTLINES_BY_VIEWPOINT.validate_json(path.read_bytes())
 
 
@@ -144,21 +144,21 @@ class OutlineSource:
     Attributes:
         source: version of the outlines, which changes with what would be drawn.
         artefact: file with the outlines.
-        T_camera_scan: of the frame of `spheres`; None while it is not known.
+        T_camera_scan: the pose of the frame of `spheres`; None while it is not known.
         live: the artefact is a file of the job `live_view`, which holds one image; others hold all, by viewpoint.
     """
 
     source: str
     artefact: str
     spheres: tuple[Sphere, ...]
-    camera: CameraModel  # of the images in which the outlines were found
-    photograph: CameraModel  # of the photographs as captured, which may be larger
+    camera: CameraModel  # camera of the images in which the outlines were found
+    photograph: CameraModel  # camera of the photographs as captured, which may be larger
     T_camera_scan: Transform | None
     live: bool
 
 
 def outlines_of(log: RunRecord, capture: Capture, device: str = "") -> OutlineSource | None:
-    """The registration's outlines of a valid image, else what the live numbers found, else None.
+    """Return the registration's outlines of a valid image, else what the live numbers found, else None.
 
     `device`: a further camera, whose image it is; "" for the first one.
     """
@@ -188,7 +188,7 @@ def outlines_of(log: RunRecord, capture: Capture, device: str = "") -> OutlineSo
 
 
 def _of_further(log: RunRecord, capture: Capture, device: str) -> OutlineSource | None:
-    """The outlines in the image of a further camera, as the registration measured them, or as it arrived."""
+    """Return the outlines in the image of a further camera, as the registration measured them, or as it arrived."""
     mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
     located = further_cameras(log.protocol, log.state).get(device)
     registered, viewpoint = displayed_registration(log), capture.payload.viewpoint
@@ -208,7 +208,7 @@ def _of_further(log: RunRecord, capture: Capture, device: str) -> OutlineSource 
 
 
 def marks_of(log: RunRecord, capture: Capture, device: str = "") -> tuple[DrawnOutline, ...]:
-    """Outlines with numbers: registration spheres 0, 1, 2 …, control spheres C0, C1 …, and what is neither."""
+    """Return outlines with numbers: registration spheres 0, 1, 2 …, control spheres C0, C1 …, and what is neither."""
     found = outlines_of(log, capture, device)
     if found is None:
         return ()

@@ -1,4 +1,4 @@
-"""Small copies of large photographs, kept in DIR/cache: made once, replaced as a whole, never evidence."""
+"""Small copies of large photographs in DIR/cache: made once, replaced as a whole, never evidence."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class DrawnOutline:
     """The outline of one sphere in one image.
 
     Attributes:
-        kind: what it is of.
-        label: written into it.
+        kind: the kind of thing whose outline it is.
+        label: the text that is written into it.
         outline_px: (L, 2) points in pixels of the image as captured.
     """
 
@@ -60,12 +60,12 @@ _REMEDY = "Download the recorded file and look at it; it is kept unchanged as ev
 
 
 def nearest_width(width: int, among: Sequence[int] = WIDTHS) -> int:
-    """The smallest size on offer that is at least `width`, or the largest."""
+    """Return the smallest size on offer that is at least `width`, or the largest."""
     return next((known for known in among if known >= width), among[-1])
 
 
 def cached(folder: Path, key: str, suffix: str, make: Callable[[], bytes]) -> Path:
-    """The file of a key, made when it is not there. Raises OSError, and what `make` raises."""
+    """Return the file of a key, made when it is not there. Raises OSError, and what `make` raises."""
     digest = hashlib.sha256(f"{_VERSION} {key}".encode()).hexdigest()
     path = folder / "cache" / digest[:2] / f"{digest}{suffix}"
     if not path.is_file():
@@ -78,7 +78,7 @@ def cached(folder: Path, key: str, suffix: str, make: Callable[[], bytes]) -> Pa
 
 
 def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, upright: bool = False) -> bytes:
-    """A JPEG of this width, or of the picture's own width if that is smaller, with outlines drawn over it.
+    """Return a JPEG of this width, or of the picture's own width if that is smaller, with outlines drawn over it.
 
     With `upright` it is rotated as its orientation tag says, for people; otherwise it is as stored, for measuring.
 
@@ -132,6 +132,6 @@ def _segments(curve: NDArray[np.int32], dash: tuple[int, int] | None) -> list[ND
 
 
 def safe_name(name: str, sha256: str) -> str:
-    """A safe name for a download: no folder, and no characters with a meaning for a shell or a header."""
+    """Return a safe name for a download: no folder, and no characters with a meaning for a shell or a header."""
     last = _SAFE_NAME.sub("_", name.replace("\\", "/").rsplit("/", 1)[-1]).strip(" .")
     return last[-120:].lstrip(" .") or sha256[:12]

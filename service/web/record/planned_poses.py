@@ -37,11 +37,11 @@ class StationPlan:
     """A station, as needed to draw a plan of it."""
 
     layout: StationLayout
-    specimen_m: tuple[float, float]  # along the approach, across it
+    specimen_m: tuple[float, float]  # size along the approach, and across it
 
 
 def station_of(log: RunRecord, name: str) -> StationPlan | None:
-    """A station of the rig as it was when the run began; None if the rig has no such station."""
+    """Return a station of the rig as it was when the run began; None if the rig has no such station."""
     section = recorded_rig_section(log)
     there = section.stations.get(name)
     if there is None:
@@ -53,12 +53,12 @@ def station_of(log: RunRecord, name: str) -> StationPlan | None:
 
 
 def planned_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
-    """The viewpoints of the protocol, then those that an attempt of the step has suggested."""
+    """Return the viewpoints of the protocol, then those that an attempt of the step has suggested."""
     return _planned(log, step)[0]
 
 
 def planned_viewpoints(log: RunRecord, step: Step) -> tuple[PlannedPose, ...]:
-    """Positions and viewing directions of the planned poses."""
+    """Return positions and viewing directions of the planned poses."""
     return _planned(log, step)[1]
 
 
@@ -70,7 +70,7 @@ _OF_PLANS = (BOARD_POSES, SUGGESTION)
 
 
 def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[PlannedPose, ...]]:
-    """Computed once for each first event (protocol, rig) and set of the step's notes, which determine the poses."""
+    """Compute poses once for each first event (protocol, rig) and set of the step's notes: these determine them."""
     notes = tuple(note.seq for note in log.state.steps[step.id].notes if note.note in _OF_PLANS)
     key = (log.events[0].sha256, step.id, notes)
     with _lock:
@@ -107,12 +107,12 @@ def _computed_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
 
 
 def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
-    """Position and optical axis of a camera pose."""
+    """Return the position and optical axis of a camera pose."""
     return _vector(T_base_camera[:3, 3]), _vector(T_base_camera[:3, 2])
 
 
 def nominal_T_flange_camera(log: RunRecord) -> tuple[tuple[float, float, float, float], ...] | None:
-    """T_flange_camera by the design of the camera's mount; None if the rig file does not state it."""
+    """Return T_flange_camera by the design of the camera's mount; None if the rig file does not state it."""
     return recorded_rig_section(log).T_flange_camera_nominal
 
 

@@ -48,7 +48,7 @@ Reason = Annotated[str, Form(max_length=REASON_CHARACTERS)]
 
 
 class StartForm(BaseModel):
-    """What a run is begun with: a protocol file, and what people enter about the run, of which it needs the specimen.
+    """The form that starts a run: a protocol file, and what people enter about the run, which must name the specimen.
 
     A protocol whose content was changed without a new version also needs a reason and a password.
     """
@@ -70,16 +70,16 @@ class ActionForm(BaseModel):
         verb: the action.
         step: identifier of the step; "" for the current one.
         current: the step at which the run was, as the page showed it; a redo is of another one.
-        attempt: of that step, as the page showed it.
-        viewpoint: that is redone; "" for the whole step.
+        attempt: the attempt of that step, as the page showed it.
+        viewpoint: the viewpoint that is redone; "" for the whole step.
         replaces: number of the event whose image of the viewpoint the page said is replaced; 0 for none.
-        moves: whether the page said that the robot then drives there at once.
+        moves: true if the page said that the robot then drives there at once.
         preset: a reason chosen from the list.
-        reason: words that are added to it.
-        meaning: what a signature stands for.
-        known_by: what `password` holds: the password, or a PIN or badge where the site allows them for signatures.
-        password: see `known_by`.
-        account: of the person who accepts, where that is not the person who is signed in.
+        reason: text that is added to it.
+        meaning: the meaning of a signature.
+        known_by: the kind of secret in `password`: a password, or a PIN or badge where the site allows them to sign.
+        password: the secret of the person who acts; `known_by` says of which kind.
+        account: the account of the person who accepts, where that is not the person who is signed in.
         signed_sha256: hash of the record that a signature or acceptance binds.
         seen_seq: number of the last event that the page showed.
         back: page to return to; "" for the run's page.
@@ -315,7 +315,7 @@ def cancel(
 
 
 def _action(form: ActionForm, state: RunState, who: Identity | None) -> OperatorAction:
-    """The event of a form; `who` is the person who identified themselves for this action, if anybody had to."""
+    """Return the event of a form; `who` is the person who identified themselves for this action, if one had to."""
     reason = full_reason(form.preset, form.reason)
     return OperatorAction(
         action=form.verb,
@@ -358,7 +358,7 @@ def _require_shown(log: RunRecord, form: ActionForm) -> None:
 
 
 def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> None:
-    """A page that shows an earlier question must not answer a later one."""
+    """Refuse the answer of a page that shows an earlier question."""
     state = log.state
     since = (event.payload for event in log.events[seen_seq:])
     if (step, attempt) != (state.current, state.step.attempt) or not all(isinstance(p, _HARMLESS) for p in since):
@@ -366,7 +366,7 @@ def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> 
 
 
 def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
-    """A redo does what its form said: from where the run was, of that image, and with that motion or none."""
+    """Refuse a redo that differs from what its form said: the run's place, the image, whether the robot moves."""
     state = log.state
     if (form.current, form.attempt) != (state.current, state.step.attempt):
         raise out_of_date(state)
@@ -385,7 +385,7 @@ def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
 
 
 def _require_losses_seen(log: RunRecord, seen_seq: int) -> None:
-    """Whoever lets the robot move says to have looked at an arm whose connection was lost, so the page said so."""
+    """Refuse to let the robot move if the page did not show every arm whose connection was lost."""
     moves = log.protocol.step(log.state.current).moves_robot
     if moves and any(loss.seq > seen_seq for loss in lost_arms(log.state).values()):
         raise out_of_date(log.state)

@@ -58,7 +58,7 @@ class PageNote:
 
 
 def notes_of(events: Iterable[Event], step: str = "") -> tuple[PageNote, ...]:
-    """The notes of a run, or of one of its steps, in order."""
+    """Return the notes of a run, or of one of its steps, in order."""
     return tuple(
         PageNote(event.seq, event.at_utc, event.actor, note.step, note.text, note.photograph)
         for event in events
@@ -99,7 +99,7 @@ _CHECK_S = 5.0
 
 @router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
 async def stream(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> StreamingResponse:
-    """`changed` with {"seq", "monitor", "locked"} whenever one of them has changed.
+    """Send `changed` with {"seq", "monitor", "locked"} whenever one of them has changed.
 
     `replaced` ends the stream: the sign-in has opened more streams than it may have, and this is the oldest.
     """
@@ -141,12 +141,12 @@ async def _news(request: Request, site: Site, screen: str, run_id: str) -> Async
 
 
 def _signed_in(site: Site, token: str) -> Person | None:
-    """Who sits there; a screen that was left alone is locked by this look."""
+    """Return who sits there; a screen that was left alone is locked by this look."""
     return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
 
 
 def newest(site: Site, run_id: str) -> tuple[int, int]:
-    """The last event, and a number that changes with the runner's reports, its silence, control, and a coat's age.
+    """Return the last event, and a number that changes with the runner's reports or silence, control, a coat's age.
 
     Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.
     """
@@ -158,7 +158,7 @@ def newest(site: Site, run_id: str) -> tuple[int, int]:
 
 
 def _ages(site: Site, run_id: str) -> list[str]:
-    """What the pages say of a coat's age; nothing of a run that cannot be read, which its pages say themselves."""
+    """Return what the pages say of a coat's age; nothing of an unreadable run, as its pages say so themselves."""
     try:
         return [coat.title for coat in coats_of(site, site.run(run_id))]
     except OrthocaptureError:
@@ -172,25 +172,25 @@ _DRAWINGS = files("service.web.run") / "drawings"
 
 @dataclass(frozen=True, slots=True)
 class RunPage:
-    """What the page shows.
+    """The data that the page shows.
 
     Attributes:
         view: the run and the step on the screen.
         acceptors: accounts that may accept the question's figures.
         looking_back: the step on the screen is not the current one.
-        dialog: the one that is open without script; "" for none.
+        dialog: the dialog that is open without script; "" for none.
         notes: people's notes on the step, or on the whole run once it has ended.
-        about: what was entered when the run began: name and text.
-        reasons: presets of the protocol.
-        signing: what may stand for a password.
-        drawing: beside the instructions.
-        lens_step: the live view belongs to this step.
+        about: the name and text of each thing that was entered when the run began.
+        reasons: the protocol's presets of reasons.
+        signing: the secrets that may stand for a password.
+        drawing: the drawing beside the instructions.
+        lens_step: true if the live view belongs to this step.
         board_plan: version of the plan of the step's board images; 0 for other steps.
         now_utc: time of the page.
         depends: acceptances on which the run's results depend.
         result_table: rows of the evaluation.
-        result_note: what some of these rows share.
-        further_cameras: of the rig, for the live view.
+        result_note: a note on what some of these rows share.
+        further_cameras: the rig's further cameras, for the live view.
     """
 
     view: RunView
@@ -215,7 +215,7 @@ class RunPage:
 def run(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "", dialog: Name = ""
 ) -> HTMLResponse:
-    """The current step, or another one to look at."""
+    """Show the current step, or another one to look at."""
     shown = _shown(site, person, run_id, step, dialog)
     return render(request, "run/run.html.j2", shown, frame=run_frame(site, run_id))
 
@@ -224,7 +224,7 @@ def run(
 def run_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
-    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
+    """Show parts of the page, all from the same moment, for the script that keeps the page up to date."""
     asked = names.split(",")
     frame = run_frame(site, run_id) if "banner" in asked else None
     shown = None if asked == ["banner"] else _shown(site, person, run_id, step)
@@ -269,20 +269,20 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
 
 
 def _aims(view: RunView) -> bool:
-    """Whether a person focuses or aims the camera now: the live view belongs there."""
+    """Return whether a person focuses or aims the camera now: the live view belongs there."""
     focuses = view.shown.drawing == "camera" and view.shown.only_ticks
     aims = view.shown.drawing == "layout_photo" and view.mode in ("ask", "more")
     return view.shown.current and (focuses or aims)
 
 
 def _about(log: RunRecord) -> list[tuple[str, str]]:
-    """What was entered of the run when it began."""
+    """Return what was entered of the run when it began."""
     root = log.events[0].payload
     return about_rows(root.about) if isinstance(root, RunStarted) else []
 
 
 def _board_plan(log: RunRecord, step: str) -> int:
-    """Version of the plan of a step's board images: one more than the plans that are recorded; 0 for other steps."""
+    """Return the version of a step's plan of board images: one more than the recorded plans; 0 for other steps."""
     if getattr(log.protocol.step(step).params, "board_poses", None) is None:
         return 0
     return 1 + sum(note.note == "board_poses" for note in log.state.steps[step].notes)
@@ -316,7 +316,7 @@ def _viewer(site: Site, person: Person, log: RunRecord) -> Viewer:
 
 
 def _taken_from(log: RunRecord, account: str) -> tuple[Event, ControlTaken] | None:
-    """The last change of control, if somebody else took it from this person."""
+    """Return the last change of control, if somebody else took it from this person."""
     changes = ((event, taken) for event in reversed(log.events) if isinstance(taken := event.payload, ControlTaken))
     last = next(changes, None)
     if last is None or last[0].actor == account:
@@ -332,7 +332,7 @@ def _drawings() -> dict[str, Markup]:
 
 
 def drawing(step: Step) -> Markup:
-    """The drawing of a step, to stand in a page: one of ours, or the SVG of a plug-in's kind; empty without one."""
+    """Return a step's drawing, to stand in a page: one of ours, or the SVG of a plug-in's kind; empty without one."""
     kind = step_kinds().get(step.kind)
     own = "" if kind is None else kind.drawing
     found = _drawings().get(step.drawing or own)

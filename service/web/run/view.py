@@ -1,4 +1,4 @@
-"""What the run page shows, as plain data: a pure function of the record, the runner's last word and who looks."""
+"""What the run page shows, as plain data: a pure function of the record, the runner's last report and who looks."""
 
 from __future__ import annotations
 
@@ -70,18 +70,18 @@ def run_view(
     earlier: EarlierTimes = NOT_MEASURED,
     now_utc: str = "",
 ) -> RunView:
-    """The page of a run that has begun.
+    """Return the page of a run that has started.
 
     Args:
         log: the run's record.
         snapshot: the runner's latest report.
-        viewer: who looks at the page.
-        driven: whether a running process drives the run.
+        viewer: the person who looks at the page.
+        driven: true if a running process drives the run.
         show: step to look at; the current one if it is "" or unknown.
-        to_come: what is still being computed, in words.
+        to_come: texts on what is still being computed.
         computing: the jobs that wait or are computed, which a person may end.
         space: forecast of what the run will still write; None if it is not known.
-        earlier: how long the steps took in earlier runs.
+        earlier: the times that the steps took in earlier runs.
         now_utc: the time of the page; "" where none is to be compared with it.
     """
     protocol, state = log.protocol, log.state
@@ -128,7 +128,7 @@ _DECIDED = frozenset({"confirm", "sign", "redo", "skip", "accept", "resume"})
 
 
 def _judged(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Iterator[JudgedStep]:
-    """The steps whose verdicts came since a person last decided something: nobody may have seen them yet."""
+    """Yield the steps whose verdicts came since a person last decided something: nobody may have seen them yet."""
     acts = (event for event in reversed(events) if isinstance(event.payload, ItemTicked | OperatorAction))
     decided = (event.seq for event in acts if not isinstance(act := event.payload, OperatorAction) or _decides(act))
     since = next(decided, 0)
@@ -171,7 +171,7 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
 
 
 def _paused_words(state: RunState, snapshot: Snapshot) -> str:
-    """How it stands with a paused run and its robot; what is not known to stand still is not said to."""
+    """Return how it stands with a paused run and its robot; what is not known to stand still is not said to."""
     if snapshot.doing != "paused" or snapshot.robot == "moving":
         return "Pausing… the robot may still move."
     if lost_arms(state):
@@ -261,7 +261,7 @@ def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) ->
 
 
 def _again(protocol: Protocol, state: RunState, decision: object) -> MainAction | None:
-    """Another attempt: what the step asks for in its normal course, or one more try after something went wrong."""
+    """Offer another attempt: what the step asks for in its normal course, or one more try after a failure."""
     moves, wanted = protocol.step(state.current).moves_robot, state.step.in_course
     if wanted is not None:
         return MainAction("confirm", wanted.does, "What was taken before is kept.", hold=moves)
@@ -296,12 +296,12 @@ def _more(state: RunState) -> StepMore | None:
 
 
 def _tab(protocol: Protocol, state: RunState, shown: str, mode: str) -> str:
-    """The title of the page in the browser's tab."""
+    """Return the title of the page in the browser's tab."""
     return f"Run {state.status}" if mode == "ended" and shown == state.current else protocol.step(shown).title
 
 
 def _photographs(events: Sequence[Event]) -> int:
-    """The photographs in the record: views, those that were replaced too, and others that a camera gave."""
+    """Return the photographs in the record: views, those that were replaced too, and others that a camera gave."""
     views = sum(isinstance(event.payload, RecordedView) for event in events)
     kept = (event.payload for event in events if isinstance(event.payload, FilesKept))
     return views + sum(ref.kind == "layout_image" for files in kept for ref in files.artefacts)
@@ -336,7 +336,7 @@ _BUTTONS: Mapping[OperatorVerb, str] = {
 
 
 def _ways(decision: object, mode: str) -> tuple[Choice, ...]:
-    """The choices; without what the large button does, where that is the normal course and stands above."""
+    """Return the choices; without what the large button does, where that is the normal course and stands above."""
     if not isinstance(decision, AskOperator):
         return ()
     return tuple(_way(way) for way in decision.ways if mode != "more" or way.verb != "confirm")

@@ -49,7 +49,7 @@ class CaptureProgress:
     total: int
     percent: float
     left: str  # "about 12 min" or "measuring"
-    step_done: int  # in the current step
+    step_done: int  # images taken in the current step
     step_total: int
     step_left: str
 
@@ -65,7 +65,7 @@ class Reading:
 
 
 def gate_lines(step: Step, now: StepState, skipped: frozenset[str]) -> tuple[GateLine, ...]:
-    """Every gate of a step with what is known of it."""
+    """Return every gate of a step with what is known of it."""
     known = {verdict.measure: verdict for verdict in now.verdicts}
     accepted = now.accepted is not None
     return tuple(_gate_line(gate, known.get(gate.measure), skipped, accepted=accepted) for gate in step.gates)
@@ -88,7 +88,7 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str],
 
 
 def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> CaptureProgress:
-    """Counted from the record; the time left from the times between this run's own exposures."""
+    """Count the progress from the record; estimate the time left from the times between this run's own exposures."""
     data_set = [s for s in protocol.steps if getattr(s.params, "purpose", "") == "dataset"]
     total = sum(planned_views(step) for step in data_set)
     done = sum(min(len(state.steps[step.id].captured), planned_views(step)) for step in data_set)
@@ -117,7 +117,7 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
 
 
 def view_intervals_s(events: Sequence[Event], step: str | None = None) -> list[float]:
-    """Seconds between two exposures of the same attempt of a step, without a restart or a person's act in between."""
+    """Return seconds between exposures of the same attempt of a step, without a restart or a person's act between."""
     chains: list[list[tuple[str, int, float]]] = [[]]
     for event in events:
         if isinstance(event.payload, SessionStarted | OperatorAction):  # a pause is not the time of a view
@@ -137,12 +137,12 @@ def _left(each_s: float | None, views: int) -> str:
 def readings(
     snapshot: Snapshot, space: Forecast | None = None, clocks: Sequence[ClockReading] = ()
 ) -> tuple[Reading, ...]:
-    """What the runner last reported of the machine and the devices; what it did not report is shown as unknown.
+    """Return what the runner last reported of machine and devices; what it did not report is shown as unknown.
 
     Args:
-        snapshot: of the runner.
-        space: what the run will still write, where it is known.
-        clocks: as last compared; those beyond their limits are shown.
+        snapshot: the runner's snapshot.
+        space: forecast of what the run will still write, where it is known.
+        clocks: the clocks as last compared; those beyond their limits are shown.
     """
     battery = snapshot.camera_battery_fraction
     return (
@@ -201,10 +201,10 @@ class RecordOfRun(Interface):
 
 @dataclass(frozen=True, slots=True)
 class Viewer:
-    """Who looks, and how they stand to the control of this run."""
+    """The person who looks, and how they stand to the control of this run."""
 
     may_operate: bool = False
-    may_sign: bool = False  # with or without control
+    may_sign: bool = False  # true with or without control
     role: str = ""
     loses_release: bool = False  # this person could release the run, and acting on it ends that
     may_take_over: bool = False
@@ -249,9 +249,9 @@ class JudgedStep:
 
     step: str
     title: str
-    seq: int  # of the event by which it passed
+    seq: int  # number of the event by which it passed
     figures: tuple[str, ...]
-    accepted: bool  # outside its limits
+    accepted: bool  # figures were accepted outside their limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,16 +274,16 @@ class StepView:
     checklist: tuple[ChecklistItem, ...]
     open_items: int
     gates: tuple[GateLine, ...]
-    warning: str  # of an irreversible step that has not been done
+    warning: str  # warning of an irreversible step that has not been done
     requires: tuple[tuple[str, bool], ...]
     captured: int
-    unused: int  # of them, board images without use
+    unused: int  # number of these that are board images without use
     planned: int
     signed_by: str
     skipped: bool
     started_utc: str
     ended_utc: str
-    table: Sequence[Row]  # of an evaluation
+    table: Sequence[Row]  # rows of an evaluation
     usual: str  # how long it usually takes; "" if that is not known, or it is done
     depends: tuple[AcceptedGate, ...]  # figures accepted outside their limits that this step depends on
 
@@ -308,16 +308,16 @@ class StepRedo:
     step: str
     title: str
     resets: tuple[str, ...]
-    images: int  # whose evidence stays, but which no longer count
+    images: int  # number of images whose evidence stays, but which no longer count
 
 
 @dataclass(frozen=True, slots=True)
 class SignedContent:
-    """What a signature binds."""
+    """The content that a signature binds."""
 
     sha256: str
     title: str
-    figures: tuple[tuple[str, tuple[str, ...]], ...]  # by step
+    figures: tuple[tuple[str, tuple[str, ...]], ...]  # figures by step
     meaning: str  # offered; the person may change it
 
 
@@ -325,7 +325,7 @@ class SignedContent:
 class Acceptance:
     """The figures outside their limits that can be accepted now, and who may accept them."""
 
-    sha256: str  # of the figures that the acceptance binds
+    sha256: str  # hash of the figures that the acceptance binds
     title: str
     figures: tuple[str, ...]
     role: str
@@ -346,7 +346,7 @@ class StepTrouble:
 
 @dataclass(frozen=True, slots=True)
 class StepMore:
-    """What a step asks for in its normal course before it can be judged."""
+    """The request of a step in its normal course for more, before it can be judged."""
 
     title: str
     advice: str
@@ -362,30 +362,30 @@ class Choice:
     words: str
     takes: str
     loses: str
-    why_not: str  # "" where it can be taken
+    why_not: str  # "" if it can be taken
     button: str
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What the run asks of people now, and what they can do.
+    """The question that the run asks of people now, and what they can do.
 
     Attributes:
         main: the one large button; None if there is nothing to press.
         options: further actions.
-        can_pause: whether this person can pause the run.
+        can_pause: true if this person can pause the run.
         asked_anew: the program that drove the robot has ended, or the confirmation was too long ago, so nothing moves
             before somebody confirms again.
-        lapsed: why the confirmation no longer holds; "" where the program has ended.
+        lapsed: the reason why the confirmation no longer holds; "" where the program has ended.
         standing: the run is paused and the robot is known to stand still.
-        paused: how it stands with a paused run and its robot, in words.
-        more: what the step asks for in its normal course; None for nothing, or where something went wrong.
-        trouble: why the run is stopped; None if it is not.
-        ways: what can be done about that, the recommended one first.
-        signature: what is to be signed; None for nothing.
-        acceptance: what could be accepted outside its limits; None for nothing.
+        paused: a text on how it stands with a paused run and its robot.
+        more: the step's request in its normal course; None for nothing, or where something went wrong.
+        trouble: the trouble for which the run is stopped; None if it is not.
+        ways: the ways out of that, the recommended one first.
+        signature: the content to be signed; None for nothing.
+        acceptance: the figures that could be accepted outside their limits; None for nothing.
         redos: steps that can be done again.
-        skip_overrides: whether a skip would now override figures outside their limits.
+        skip_overrides: true if a skip would now override figures outside their limits.
     """
 
     main: MainAction | None
@@ -406,7 +406,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class RunView:
-    """The run page."""
+    """The data that the run page shows."""
 
     run_id: str
     title: str
@@ -420,7 +420,7 @@ class RunView:
     steps: tuple[StepLine, ...]
     passed: int
     shown: StepView
-    judged: tuple[JudgedStep, ...]  # since a person last decided something, the newest first
+    judged: tuple[JudgedStep, ...]  # steps judged since a person last decided something, the newest first
     question: Question
     viewer: Viewer
     progress: CaptureProgress
@@ -428,7 +428,7 @@ class RunView:
     working: tuple[str, int, int]
     takes: tuple[str, ...]  # how long the work usually takes, and until when nobody is needed
     work_left: str  # how long the rest of the run usually takes; "" if that is not known
-    tries: str  # what failed and is tried again by itself, in words; "" for nothing
+    tries: str  # a text on what failed and is tried again by itself; "" for nothing
     deviations: tuple[Deviation, ...]
     news: tuple[tuple[str, str], ...]
     to_come: tuple[str, ...]  # results that are still being computed, with the time left

@@ -1,4 +1,4 @@
-"""The scene of a run as far as it is known, registered or planned, for the 3D view and in words and numbers."""
+"""The scene of a run as far as it is known, registered or planned, for the 3D view and in text and numbers."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class KnownScene:
     """A scene and what pages say about it.
 
     Attributes:
-        frame: of the positions, in words.
-        how: where the poses come from, in words.
-        missing: what is not shown, and why.
+        frame: a text on the frame of the positions.
+        how: a text on the origin of the poses.
+        missing: texts on what is not shown, and why.
         mesh: file of the surface; None: there is none yet.
-        sphere_images: by sphere's label, in how many images it was seen.
+        sphere_images: number of images in which each sphere was seen, by its label.
     """
 
     scene: Scene
@@ -74,7 +74,7 @@ class MeshFacts:
 
 
 def scene_of(log: RunRecord) -> KnownScene:
-    """The best known scene: registered, else provisional, else planned."""
+    """Return the best known scene: registered, else provisional, else planned."""
     registered = displayed_registration(log)
     if registered is not None:
         return _registered(log, registered)
@@ -118,7 +118,7 @@ def _registered(log: RunRecord, registered: DisplayedRegistration) -> KnownScene
 
 
 def _wound(log: RunRecord) -> tuple[Point, ...]:
-    """The outline of the wound that the last fusion used, in the frame of the scan; empty where there is none."""
+    """Return the outline of the wound that the last fusion used, in the frame of the scan; empty without one."""
     steps = [log.state.steps[step.id] for step in log.protocol.steps if step.gives == "ground_truth"]
     jobs = [job for step in steps for job in step.jobs.values()]
     done = [job for job in jobs if job.kind == fuse.KIND.name and job.status == "finished"]
@@ -127,7 +127,7 @@ def _wound(log: RunRecord) -> tuple[Point, ...]:
 
 
 def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], list[str]]:
-    """T_scan_base by station: from this registration, or from one of the same run that keeps the stations apart."""
+    """Return T_scan_base by station, of this registration or of one of the run that keeps the stations apart."""
     known_registrations = registrations(log.protocol, log.state)
     known = [record, *(known_registrations[n] for n in _WITH_STATIONS if n in known_registrations)]
     for candidate in known:
@@ -141,7 +141,7 @@ def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], 
 
 
 def _live(log: RunRecord) -> KnownScene | None:
-    """The scene in the CT frame, by the newest provisional registration of each station; None while there is none."""
+    """Return the scene in the CT frame, by each station's newest provisional registration; None without one."""
     records: dict[str, LivePose] = {}
     for step in log.protocol.steps:
         for capture in captures_of(log, step.id):
@@ -182,7 +182,7 @@ def _live(log: RunRecord) -> KnownScene | None:
 
 
 def _live_further(log: RunRecord) -> dict[str, dict[str, Transform]]:
-    """T_ct_camera of further cameras, each by its image alone; of one that stands still, the newest."""
+    """Return T_ct_camera of further cameras, each by its image alone; of one that stands still, the newest."""
     found: dict[str, dict[str, Transform]] = {}
     for step in log.protocol.steps:
         for capture in captures_of(log, step.id):
@@ -198,7 +198,7 @@ def _live_further(log: RunRecord) -> dict[str, dict[str, Transform]]:
 
 
 def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
-    """Viewpoints of the current step that are still to be taken: name, station, T_base_camera."""
+    """Return viewpoints of the current step that are still to be taken: name, station, T_base_camera."""
     state = log.state.step
     if log.state.terminal:
         return []
@@ -211,7 +211,7 @@ def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
 
 
 def _planned(log: RunRecord) -> KnownScene:
-    """One station in its base frame: past camera poses by the mount's design, and planned ones."""
+    """Return one station in its base frame: past camera poses by the mount's design, and planned ones."""
     captured = _all_captures(log)
     to_come = _to_come(log)
     station = to_come[0][1] if to_come else captured[-1].station if captured else ""
@@ -241,7 +241,7 @@ def _planned(log: RunRecord) -> KnownScene:
 
 
 def _table(centre_m: tuple[float, float, float]) -> SceneMesh:
-    """A square of 0.4 m where the scene is expected."""
+    """Return a square of 0.4 m where the scene is expected."""
     offsets = 0.2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     return SceneMesh(np.array(centre_m) + offsets, np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -255,7 +255,7 @@ def _all_captures(log: RunRecord) -> list[RecordedView]:
 
 
 def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
-    """The scene with its surface, decimated once and then kept in DIR/cache; coloured by the predicted error."""
+    """Return the scene with its surface, which is decimated once and cached; coloured by the predicted error."""
     if now.mesh is None:
         return now.scene
     points, triangles, _ = _surface(log, now.mesh, data)
@@ -264,13 +264,13 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
 
 
 def predicted_error_mm(registered: DisplayedRegistration, points_m: Array) -> Array:
-    """3D standard deviation (N,) of points (N, 3) of the scan, due to the registration with the images, mm."""
+    """Return the 3D standard deviation (N,) of points (N, 3) of the scan by the registration with images, mm."""
     placed = Alignment(np.array(registered.record.T_world_scan), np.array(registered.record.covariance)[:6, :6])
     return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)
 
 
 def mesh_facts(now: KnownScene, log: RunRecord, data: Path) -> MeshFacts | None:
-    """Facts about the surface; None without a surface."""
+    """Return facts about the surface; None without a surface."""
     return None if now.mesh is None else _surface(log, now.mesh, data)[2]
 
 
@@ -307,19 +307,19 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class CameraRow:
-    """A camera pose; a planned one has not been taken yet."""
+    """A row of the table of camera poses; a planned one has not been taken yet."""
 
     name: str
     station: str
     position_mm: Vector
-    tilt_deg: float  # of the optical axis from straight down
-    distance_mm: float  # from the middle of the spheres
+    tilt_deg: float  # tilt of the optical axis from straight down
+    distance_mm: float  # distance from the middle of the spheres
     planned: bool
 
 
 @dataclass(frozen=True, slots=True)
 class SphereRow:
-    """A sphere."""
+    """A row of the table of spheres."""
 
     label: str
     kind: str
@@ -331,11 +331,11 @@ class SphereRow:
 
 @dataclass(frozen=True, slots=True)
 class StationRow:
-    """A robot base."""
+    """A row of the table of robot bases."""
 
     name: str
     position_mm: Vector
-    distance_mm: float  # from the middle of the spheres
+    distance_mm: float  # distance from the middle of the spheres
     cameras: int
 
 
@@ -355,7 +355,7 @@ class SceneTables:
 
 
 def scene_tables(log: RunRecord, data: Path) -> SceneTables:
-    """The tables; positions are in the frame that the record uses, not in that of the picture."""
+    """Return the tables; positions are in the frame that the record uses, not in that of the picture."""
     now = scene_of(log)
     T_view = viewing_frame(now.scene)
     down, centre = -T_view[2, :3], -T_view[:3, :3].T @ T_view[:3, 3]

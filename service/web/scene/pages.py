@@ -28,11 +28,11 @@ class DrawnRow:
     by: str
     source: str
     corners: int
-    used: bool  # by the fusion whose result the run has
+    used: bool  # used by the fusion whose result the run has
 
 
 def drawn_rows(log: RunRecord) -> tuple[DrawnRow, ...]:
-    """The regions drawn in a run, oldest first."""
+    """Return the regions drawn in a run, oldest first."""
     rows: list[DrawnRow] = []
     for found in log.state.drawn:
         jobs = log.state.steps[found.region.step].jobs.values()
@@ -81,7 +81,7 @@ FRAME_HEADERS = {
 
 @router.get("/runs/{run_id}/scene", name="scene", dependencies=[Depends(requires("read"))])
 def scene(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> HTMLResponse:
-    """The 3D view in its frame, and everything in it as tables."""
+    """Show the 3D view in its frame, and everything in it as tables."""
     from service.web.scene.data import scene_tables  # noqa: PLC0415 - mesh and matching, not needed to start
 
     log = site.run(run_id)
@@ -104,7 +104,7 @@ def scene(request: Request, site: CurrentSite, person: SignedInPerson, run_id: R
 def scene_frame(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, theme: Theme = "auto"
 ) -> HTMLResponse:
-    """The 3D view alone, for the sandboxed frame."""
+    """Show the 3D view alone, for the sandboxed frame."""
     from service.dataset.scene_view import scene_json, viewing_frame  # noqa: PLC0415 - as above
     from service.web.scene.data import scene_of, with_mesh  # noqa: PLC0415
 
