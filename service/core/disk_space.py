@@ -1,6 +1,6 @@
 """Forecast whether the disk has room for a run, from what is planned and what was written. Pure.
 
-The last LEAST_FREE_BYTES are kept for the evidence: no logs and no new photographs are written into them.
+The last LEAST_FREE_BYTES are reserved for the evidence: no logs and no new photographs are written into them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run will still write, and what is free."""
+    """The bytes that a run will still write, and those that are free."""
 
     views_left: int
     view_bytes: int  # one view, with what is computed from it
@@ -78,7 +78,7 @@ class Forecast:
 
     @property
     def reserve(self) -> str:
-        """What is kept free, in words."""
+        """One sentence on the space that stays free."""
         return f"the last {size_words(LEAST_FREE_BYTES)} are kept free, so that work under way can be recorded"
 
 
@@ -91,9 +91,9 @@ def forecast(
         protocol: the run's protocol.
         state: the run's state; None before it begins.
         here: sizes of its files so far.
-        before: sizes of all files of an earlier run of the same protocol; None if there was none.
+        state: the run's state; None before it begins.
         free_bytes: free space on the disk of the data folder.
-        simulated: whether the rig is simulated.
+        simulated: true for a simulated rig.
     """
     known = before if before is not None and before.views >= _ENOUGH_VIEWS else None
     own = here if here.views >= _ENOUGH_VIEWS else None

@@ -13,7 +13,7 @@ class OrthocaptureError(Exception):
     """Base of all errors of this project.
 
     Args:
-        what: what is wrong, one sentence without a full stop.
+        what: the fault in one sentence without a full stop.
         where: the file, line, field, device or record concerned.
         remedy: what the reader should do about it.
     """
@@ -35,7 +35,7 @@ class OrthocaptureError(Exception):
 
 
 def what_of(text: str) -> str:
-    """What is wrong, from the recorded text of an error: without the place and the remedy."""
+    """Return the fault from the recorded text of an error, without the place and the remedy."""
     return text.split(" [", maxsplit=1)[0].split(". ", maxsplit=1)[0].rstrip(".")
 
 

@@ -80,8 +80,8 @@ class Each:
     Attributes:
         jobs: prefixes of the jobs' keys (`step/generation/kind/`); the answers follow in the order of these prefixes.
         upto_seq: only jobs that had finished by this event count.
-        field: as in `Reference`.
-        without: ids of jobs to leave out, such as those of images that were taken again.
+        field: the field of each answer, as in `Reference`.
+        without: the ids of jobs to leave out, such as those of images that were taken again.
     """
 
     jobs: tuple[str, ...]
@@ -216,7 +216,7 @@ def _by_values(state: StepState) -> Iterator[ComputedBy]:
 
 
 def _prefix(state: StepState, job: JobState) -> str | None:
-    """What stands before the names of the job's measures in the step's; None if these are not its measures."""
+    """Return what precedes the job's names of measures in the step's; None if these are not the job's measures."""
     first = next(iter(job.measures), None)
     if first is None:
         return None

@@ -61,7 +61,7 @@ class ForeignKindError(DataError):
 
 
 def kind_of(data: bytes) -> str:
-    """What a file is by its first bytes: JPEG, PNG, WebP, HEIC, …; "" if that is not known."""
+    """Return a file's kind by its first bytes: JPEG, PNG, WebP, HEIC, …; "" if it is not known."""
     if data[:4] == b"RIFF":
         return {b"WEBP": "WebP", b"AVI ": "video"}.get(data[8:12], "")
     if data[4:8] == b"ftyp":
@@ -117,20 +117,20 @@ def check_jpeg(data: bytes, where: str) -> None:
 
 
 def end_of_jpeg(data: bytes, where: str) -> int:
-    """Length of a JPEG's picture: cameras append previews, with metadata of their own, after it.
+    """Return the length in bytes of a JPEG's picture; cameras append previews, with metadata of their own, after it.
 
     Raises:
-        DataError: as `check_jpeg`.
+        DataError: the data are no whole JPEG (`check_jpeg`).
     """
     check_jpeg(data, where)
     return next(at + 2 for marker, at in _segments(data, where) if marker == _END_OF_IMAGE)
 
 
 def without_metadata(data: bytes, where: str) -> bytes:
-    """A JPEG without EXIF, XMP, IPTC and comments, broken or not. Its colour profile stays, and each of its pixels.
+    """Return a JPEG, broken or not, without EXIF, XMP, IPTC and comments, and with its colour profile and all pixels.
 
     Raises:
-        DataError: as `check_jpeg`.
+        DataError: the data are no whole JPEG (`check_jpeg`).
     """
     end = end_of_jpeg(data, where)
     kept, begin = bytearray(), 0
@@ -177,7 +177,7 @@ def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
     """Check a JPEG, PNG or WebP without decoding it, and no other format. `partly` accepts a truncated JPEG.
 
     Raises:
-        DataError: as `check_jpeg` and `check_png`.
+        DataError: the picture is damaged (`check_jpeg`, `check_png`).
     """
     if data.startswith(PNG_BEGINS):
         check_png(data, where)

@@ -35,7 +35,7 @@ class RecordedReport:
         identity: the device.
         clock_offset_s: device clock minus host UTC, or minus host monotonic for an uptime clock; None: not reported.
         clock: uptime: it counts from power-on. Old records do not say; there the kind of device decides.
-        details: what else it says of itself, by name.
+        details: further statements of the device about itself, by name.
     """
 
     identity: RecordedIdentity
@@ -183,15 +183,15 @@ _DECIDES = frozenset({"confirm", "redo", "skip"})
 
 
 def exchanged(events: Iterable[Event], device: str, opened: RecordedIdentity) -> RecordedIdentity | None:
-    """The device that a run has used so far under this name in the rig file; None if it is the one opened now.
+    """Return the device that a run has used so far under this name in the rig file; None if it is the one opened now.
 
-    A device that states no serial number is told by its model. Another one is the run's own if it answers after
+    A device without a serial number is identified by its model. Another one is the run's own if it answers after
     a person who was asked about it has decided to go on.
 
     Args:
-        events: of the run, before this opening.
-        device: name in the rig file.
-        opened: what answered.
+        events: the run's events before this opening.
+        device: its name in the rig file.
+        opened: the device that answered.
     """
     own: RecordedIdentity | None = None
     other: RecordedIdentity | None = None  # that answered last, instead of it

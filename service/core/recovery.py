@@ -105,13 +105,13 @@ class WayOn:
     step: str  # the step concerned
     words: str
     minutes: float | None  # how long it takes; None if not known in advance
-    loses: str  # what no longer counts afterwards, in words
+    loses: str  # what no longer counts afterwards, as a phrase
     available: bool = True
     why_not: str = ""
 
 
 def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
-    """What stops the current step; None while nothing does."""
+    """Return the reason why the current step is stopped; None while nothing stops it."""
     if not state.started or state.terminal:
         return None
     if state.phase == "recovering" and not state.step.retry_granted:
@@ -149,7 +149,7 @@ def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
 
 
 def _changed(state: RunState) -> bool:
-    """Whether another device answers than the one that was calibrated: another try would not make it the same."""
+    """Return whether another device answers than the calibrated one: another try would not make it the same."""
     return state.step.failure is not None and state.step.failure.error == "DeviceChangedError"
 
 
@@ -208,7 +208,7 @@ def _computing(worked_s: float | None, views: int, each_s: float | None) -> floa
 
 
 def _all_taken(step: Step, now: StepState) -> bool:
-    """Whether every planned view is taken and the step suggests no others: a retry would change no figure."""
+    """Return whether every planned view is taken and the step suggests no others: a retry would change no figure."""
     return now.mend is None and 0 < planned_views(step) <= len(now.captured)
 
 

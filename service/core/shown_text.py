@@ -34,7 +34,7 @@ def shown_lines(text: str) -> str:
 
 
 def shown_continued(text: str) -> str:
-    """As `shown_lines`, but lines after the first are indented, so that a text from outside begins no line."""
+    """Return `shown_lines` with the lines after the first indented, so that a text from outside begins no line."""
     return shown_lines(text).replace("\n", _CONTINUED)
 
 

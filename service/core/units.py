@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # numpy is not imported for this: the pages' start does not w
 LengthUnit = Literal["m", "cm", "mm", "in"]
 METRES_PER: Mapping[LengthUnit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 LENGTH_WORDS: Mapping[LengthUnit, str] = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
-#: What lengths have to be multiplied by if one unit was taken as another, by the mistake in words.
+#: What lengths have to be multiplied by if one unit was taken as another, by a phrase for the mistake.
 MISTAKEN_LENGTHS: Mapping[str, float] = {
     f"{LENGTH_WORDS[true]} taken as {LENGTH_WORDS[taken]}": METRES_PER[true] / METRES_PER[taken]
     for true, taken in permutations(METRES_PER, 2)

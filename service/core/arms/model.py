@@ -24,11 +24,11 @@ class Link:
     """A capsule around a part of the arm: all points within `radius_m` of a segment fixed to one of the DH frames.
 
     Attributes:
-        name: of the part, as technicians know it.
+        name: the part's name, as technicians know it.
         frame: 0 is the base, k the frame after joint k.
         start_m: (3,) one end of the segment in that frame.
         end_m: (3,) the other end.
-        radius_m: of the capsule.
+        radius_m: the capsule's radius.
     """
 
     name: str
@@ -43,14 +43,14 @@ class ArmTolerances:
     """Usual errors of an arm's geometry, one standard deviation; a calibration estimates a scale of each kind.
 
     Attributes:
-        dh: of a, d (metres), α, θ (radians) of each joint.
-        lengths_m: of a and d, joint by joint; empty: those of `dh` for all.
-        twists_rad: of α, joint by joint; empty: that of `dh` for all.
-        parallel_rad: of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
-        weight: of how many parameters their common scale is known to be about 1, because they were measured on such
-            arms; 0: they are assumed, and the images alone tell the scale.
+        dh: standard deviations of each joint's a, d (metres), α and θ (radians).
+        lengths_m: those of a and d, joint by joint; empty: those of `dh` for all joints.
+        twists_rad: that of α, joint by joint; empty: that of `dh` for all joints.
+        parallel_rad: that of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
+        weight: the number of parameters whose measurement on such arms says that their common scale is about 1; 0:
+            they are assumed, and the scale is estimated from the images alone.
         gear_rad: amplitude of each harmonic of a gear's error.
-        harmonics: periods per revolution that are estimated are 1 … this number.
+        harmonics: the estimated numbers of periods per revolution are 1 … this one.
     """
 
     dh: tuple[float, float, float, float] = (0.2e-3, 0.2e-3, float(np.radians(0.015)), float(np.radians(0.04)))
@@ -59,7 +59,7 @@ class ArmTolerances:
     parallel_rad: float = float(np.radians(0.015))
     weight: float = 0.0
     gear_rad: float = float(np.radians(0.01))
-    harmonics: int = 10  # tens of poses cannot tell faster ones from noise
+    harmonics: int = 10  # tens of poses cannot distinguish faster ones from noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,21 +69,21 @@ class ArmModel:
     T_(i-1)_i = Rz(θ_i) Tz(d_i) Tx(a_i) Rx(α_i).
 
     Attributes:
-        name: the manufacturer's, as the controller states it.
-        family: which closed form solves it.
+        name: the manufacturer's name for it, as the controller gives it.
+        family: the closed form that solves it.
         a_m: (N,) link lengths.
         d_m: (N,) link offsets.
         alpha_rad: (N,) link twists.
         limits_rad: (N,) largest absolute angle of each joint.
         speeds_rad_s: (N,) largest speed of each joint.
-        acceleration_rad_s2: largest that its controller takes for a joint motion.
-        braking_rad_s2: with which the controller brakes the fastest joint when it ends a motion by itself.
+        acceleration_rad_s2: the largest that its controller accepts for a joint motion.
+        braking_rad_s2: the deceleration of the fastest joint when the controller ends a motion by itself.
         links: capsules from the base to the flange; the camera comes from the rig file.
         allowed: pairs of parts that touch by design, or cannot touch: links, `camera`, `table`, `specimen`,
             `spheres`, `surroundings`; the first of a pair is the one nearer to the base.
         usual_rad: (N,) joints of a posture with the camera above a scene that lies in the direction of the base's x.
         payload_kg: largest load on the flange.
-        tolerances: of its geometry.
+        tolerances: the usual errors of its geometry.
     """
 
     name: str
@@ -124,7 +124,7 @@ class ArmModel:
 
 
 #: How far a reported flange may be from the nominal forward kinematics of its joints. A controller computes with the
-#: arm's own factory calibration, which nobody else is told: of the published ones, none differs by 6 mm.
+#: arm's own factory calibration, which is not published: of the published ones, none differs by 6 mm.
 FITS_M = 0.010
 FITS_RAD = math.radians(2.0)
 
@@ -160,7 +160,7 @@ def pose_gap(T_a: Transform, T_b: Transform) -> tuple[float, float]:
 
 
 def fits(gap: tuple[float, float]) -> bool:
-    """Whether a flange that is reported so far (m, rad) from where its joints put it may be there all the same."""
+    """Return whether a flange may be where it is reported, this far (m, rad) from where its joints put it."""
     return gap[0] <= FITS_M and gap[1] <= FITS_RAD
 
 

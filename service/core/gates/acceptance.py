@@ -22,7 +22,7 @@ def failed_gates(step: StepState) -> tuple[GateVerdict, ...]:
 
 
 def acceptors(protocol: Protocol, state: RunState) -> frozenset[AcceptedBy]:
-    """Who may accept the failed gates of the current step by the protocol; empty when none failed."""
+    """Return who may accept the failed gates of the current step by the protocol; empty when none failed."""
     by: dict[str, AcceptedBy | None] = {g.measure: g.accept_by for g in protocol.step(state.current).gates}
     found: set[AcceptedBy] = set()
     for verdict in failed_gates(state.step):

@@ -67,7 +67,7 @@ MEASURE_NAMES: Mapping[str, str] = {
     "checklist_items_ticked": "Checklist items ticked",
     "applications": "Applications of the coat",
     "since_application_min": "Age of the coat at the scan",
-    # spheres, and how well they can be told apart
+    # spheres, and how well they can be distinguished
     "spheres_seen": "Spheres seen",
     "spheres_found": "Spheres found",
     "layout_margin_mm": "Margin against confusing four spheres",

@@ -12,11 +12,11 @@ from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.core.text.words import counted
 
-_NAMED = 20  # deviations that the words of a release name; the record has the others
+_NAMED = 20  # deviations that the text of a release names; the record has the others
 
 
 def release_meaning(state: RunState) -> str:
-    """What a person states who releases the run: that they read it, and with which deviations."""
+    """Return what a person declares who releases the run: that they read it, and with which deviations."""
     texts = [f"{one.kind.replace('_', ' ')}, {' '.join(one.text.split()).rstrip('.')}" for one in state.deviations]
     if not texts:
         return "I have read this run, in which nothing deviated from the protocol, and release it"
@@ -26,7 +26,7 @@ def release_meaning(state: RunState) -> str:
 
 
 def loses_release(protocol: Protocol, state: RunState, actor: str) -> bool:
-    """Whether a person who acts on the run now can no longer release it as the second person."""
+    """Return whether a person who acts on the run now can no longer release it as the second person."""
     return protocol.release == "second_person" and not state.released_by and actor not in state.people
 
 

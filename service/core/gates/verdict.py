@@ -106,7 +106,7 @@ def figure(verdict: GateVerdict) -> str:
 
 
 def uncertain(value: float, lower: float, upper: float, unit: str = "") -> str:
-    """A value with its bounds, `0.52 mm, 0.41 to 0.63`, with enough decimal places to tell the bounds apart."""
+    """Return a value with its bounds, `0.52 mm, 0.41 to 0.63`, and enough decimal places to distinguish them."""
     places = _places(upper - lower)
     return f"{value:.{places}f} {unit}".rstrip() + f", {lower:.{places}f} to {upper:.{places}f}"
 

@@ -181,7 +181,7 @@ class Gate(Record):
 
 
 class Recovery(Record):
-    """What happens when the work of a step fails (service.core.recovery)."""
+    """The response to failed work of a step (service.core.recovery)."""
 
     retries: Annotated[int, Field(ge=0, le=20)] = 2  # after transient device errors without progress in between
     wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
@@ -190,7 +190,7 @@ class Recovery(Record):
 
 
 class HandAction(Record):
-    """What the technician does by hand when confirming this step; a simulated rig does it by itself."""
+    """The technician's work by hand when confirming this step; a simulated rig does it by itself."""
 
     action: Text  # what the simulator is asked to do
     station: str | None = None  # where
@@ -229,37 +229,37 @@ class Step(StepFields):
 
     @property
     def moves_robot(self) -> bool:
-        """Whether the robot moves during this step; confirming it takes a held button or two pedal presses."""
+        """True if the robot moves during this step; confirming it takes a held button or two pedal presses."""
         return self.params.moves_robot
 
     @property
     def repeated(self) -> RepeatedStep:
-        """What trying this step again means."""
+        """The meaning of trying this step again."""
         return self.params.repeated
 
     @property
     def gives(self) -> Gives | None:
-        """What others look for in this step's result."""
+        """The kind of result that other steps look for in this one; None if there is none."""
         return self.params.gives
 
     @property
     def by_hand(self) -> bool:
-        """Whether a person takes this step's images with the camera in the hand."""
+        """True if a person takes this step's images with the camera in the hand."""
         return self.params.by_hand
 
     @property
     def photographs_specimen(self) -> bool:
-        """Whether this step takes images of the specimen."""
+        """True if this step takes images of the specimen."""
         return self.params.photographs_specimen
 
     @property
     def needs_disk(self) -> bool:
-        """Whether this step stores files."""
+        """True if this step stores files."""
         return self.params.needs_disk
 
     @property
     def begins_confirmed(self) -> bool:
-        """Whether a person must let it begin; always so if it moves the robot, whatever the protocol says."""
+        """True if a person must let it begin; always so if it moves the robot, whatever the protocol says."""
         return self.confirm or self.moves_robot
 
     def params_as(self, model: type[ParamsT]) -> ParamsT:

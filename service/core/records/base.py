@@ -44,10 +44,10 @@ def seconds_between(earlier_utc: str, later_utc: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """When something happened, in both clocks of the host.
+    """The time of something that happened, in both clocks of the host.
 
-    The monotonic clock begins anew with each boot and stands still while the host sleeps; UTC can be set. What one
-    of them cannot tell, the other can.
+    The monotonic clock starts again with each boot and stands still while the host sleeps; UTC can be set. Each of
+    them supplies what the other cannot.
     """
 
     monotonic_s: float
@@ -64,12 +64,12 @@ class Elapsed:
 
 
 def elapsed(earlier: Moment, later: Moment) -> Elapsed:
-    """The time from one moment to a later one, which is never negative.
+    """Return the time from one moment to a later one, which is never negative.
 
     Within one boot it is that of the monotonic clock where UTC agrees with it, and that of UTC where more of it has
     passed: the host slept, or its clock was set forward; the longer time is then the safe one. Over a reboot it is
     that of UTC. It is not known if it would be negative, if less UTC than monotonic time has passed (the clock was
-    set back), or if a record lacks what is needed to tell.
+    set back), or if a record does not have what is needed.
     """
     if not earlier.at_utc or not later.at_utc:
         return Elapsed(None, "the record has the time of one boot only, as older versions wrote it")

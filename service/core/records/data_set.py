@@ -47,9 +47,9 @@ class Party:
     """A person or a body.
 
     Attributes:
-        name: as it was given, without the identifier.
-        kind: as schema.org calls it.
-        address: of its ORCID or ROR; "" if none was given.
+        name: the name as it was given, without the identifier.
+        kind: schema.org's name for a person or a body.
+        address: the address of its ORCID or ROR; "" if none was given.
     """
 
     name: str
@@ -183,7 +183,7 @@ _Line = Annotated[str, Field(max_length=1000)]
 
 
 class DataSetStatement(Record):
-    """What an exported data set says about itself; what is left out is said to be not stated."""
+    """An exported data set's statement about itself; what is left out is reported as not given."""
 
     title: _Line = ""  # of the data set; without it, the protocol's title and the specimen
     licence: _Line = ""  # SPDX identifier such as CC-BY-4.0, or the licence's address
@@ -209,7 +209,7 @@ class DataSetStatement(Record):
         )
 
     def problems(self) -> dict[tuple[str | int, ...], DataError]:
-        """Which identifiers are wrong, by field and index. Old records are read nonetheless, new ones refused."""
+        """Return the wrong identifiers, by field and index. Old records are read nonetheless, new ones refused."""
         found: dict[tuple[str | int, ...], DataError] = {}
         checks: tuple[tuple[tuple[str | int, ...], Callable[[str], object], str], ...] = (
             (("licence",), licence_address, self.licence),

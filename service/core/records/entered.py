@@ -70,7 +70,7 @@ def about_run(
 
 
 def require_specimen(about: RunAbout) -> None:
-    """Raise ConfigurationError if the specimen is not named: nobody could tell later what was captured."""
+    """Raise ConfigurationError if the specimen is not named: nobody could say later what was captured."""
     if not about.specimen:
         raise ConfigurationError(
             "the specimen is not named",
@@ -96,7 +96,7 @@ def line(entered: str, what: str) -> str:
 
 
 def paragraphs(entered: str, what: str) -> str:
-    """`entered` without control characters, its line breaks kept.
+    """Return `entered` without control characters, and with its line breaks.
 
     Raises ConfigurationError, which calls the text `what`, if it is longer than TEXT_CHARACTERS.
     """

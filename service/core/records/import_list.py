@@ -39,7 +39,7 @@ class LeftOutFile(Record):
 
 
 class ImportList(Record):
-    """What an import consists of. The same folder gives the same list, which identifies an interrupted import."""
+    """The contents of an import. The same folder gives the same list, which identifies an interrupted import."""
 
     folder: str
     views: tuple[ImportedView, ...]
@@ -47,11 +47,11 @@ class ImportList(Record):
     left_out: tuple[LeftOutFile, ...] = ()
 
     def of(self, role: PhotographRole) -> tuple[ImportedView, ...]:
-        """The photographs with this role, in order."""
+        """Return the photographs with this role, in order."""
         return tuple(view for view in self.views if view.role == role)
 
     def holds(self, role: PhotographRole | FileRole) -> bool:
-        """Whether the list has anything with this role."""
+        """Return whether the list has anything with this role."""
         return any(view.role == role for view in self.views) or any(name == role for name in self.files)
 
     def all_files(self) -> tuple[ImportedFile, ...]:

@@ -68,12 +68,12 @@ def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int
 
 
 def needs_leave(protocol: Protocol, state: RunState) -> bool:
-    """Whether a person must confirm again before the robot moves: the runner was restarted, or the leave lapsed."""
+    """Return whether a person must confirm again before the robot moves, after a restart of the runner or a lapse."""
     return (state.restarted or state.lapse is not None) and protocol.step(state.current).moves_robot
 
 
 def redo_moves(protocol: Protocol, state: RunState, step: str) -> bool:
-    """Whether the robot drives to a viewpoint of `step` as soon as that is to be redone, without asking again."""
+    """Return whether the robot moves to a viewpoint of `step` as soon as it is to be redone, without asking again."""
     under_way = state.current == step and state.phase == "running"
     return under_way and not state.paused and not needs_leave(protocol, state)
 
@@ -84,7 +84,7 @@ def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
 
 
 def stranded(protocol: Protocol, state: RunState) -> bool:
-    """Whether the current step can never begin, because a required step has not passed and cannot be redone.
+    """Return whether the current step can never begin: a required step has not passed and cannot be redone.
 
     It may then be skipped whatever the protocol says; otherwise the run could only be ended.
     """
@@ -103,7 +103,7 @@ def skip_refusal(protocol: Protocol, state: RunState) -> Refusal | None:
 
 
 def needs_signature_now(protocol: Protocol, state: RunState) -> bool:
-    """Whether a signature is due now: before an irreversible step begins, or before any other step passes."""
+    """Return whether a signature is due now: before an irreversible step begins, or before any other step passes."""
     step = protocol.step(state.current)
     due_phase = "ready" if step.irreversible else "awaiting_operator"
     return step.sign and not state.step.signed and state.phase == due_phase
@@ -253,7 +253,7 @@ def _redo(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
 
 
 def _has_begun(state: RunState, step: Step) -> bool:
-    """Whether a step may have changed the scene; one that began counts, a skipped one does not."""
+    """Return whether a step may have changed the scene; one that began counts, a skipped one does not."""
     there = state.steps[step.id]
     return bool(there.started_utc) or any(past.step == step.id and past.began for past in state.superseded)
 

@@ -92,7 +92,7 @@ class Accept:
 
 @dataclass(frozen=True, slots=True)
 class Retry:
-    """Wait, then append StepRetried with this attempt number; what was captured is kept."""
+    """Wait, then append StepRetried with this attempt number; what was captured stays."""
 
     step: str
     attempt: int
@@ -118,7 +118,7 @@ Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | 
 
 
 def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return per phase
-    """What the runner does next. Raises IntegrityError if nothing is recorded of the run."""
+    """Return what the runner does next. Raises IntegrityError if nothing is recorded of the run."""
     if not state.started:
         raise IntegrityError("nothing is recorded of this run", remedy="Append run_started first")
     if state.status != "active":

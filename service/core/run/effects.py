@@ -85,7 +85,7 @@ def without_effect(state: RunState, event: Event) -> RunState:
 
 
 def is_void(state: RunState, event: Event, step: str, attempt: int, *, when_completed: bool = False) -> bool:
-    """Whether an operator's redo, skip or abort was recorded before the outcome of the work.
+    """Return whether an operator's redo, skip or abort was recorded before the outcome of the work.
 
     The web and the command line append actions while the runner works, so such events are legitimate; they stay in
     the evidence without effect. With `when_completed`, the work may still be recorded after the run was completed.
@@ -213,7 +213,7 @@ def session_started(protocol: Protocol, state: RunState, event: Event, p: Sessio
 
 
 def files_kept(protocol: Protocol, state: RunState, event: Event, p: FilesKept) -> RunState:
-    """Files were kept for a step: no effect on the state."""
+    """Files were stored for a step: no effect on the state."""
     return without_effect(state, event) if is_void(state, event, p.step, p.attempt) else state
 
 
@@ -290,7 +290,7 @@ def step_failed(protocol: Protocol, state: RunState, event: Event, p: StepFailed
     failure = Failure(event.seq, p.error, p.message, p.recovery, event.at_utc)
     failures = state.step.failures + 1
     tries = state.step.tries
-    if tries is None or tries.message != p.message:  # else it is the failure of a viewpoint, told before
+    if tries is None or tries.message != p.message:  # else it is the failure of a viewpoint, reported before
         tries = FailedTries("", failures, p.message, event.at_utc)
     changes = {"failure": failure, "failures": failures, "tries": tries, "worked_s": worked_s(state, event)}
     return triggered(protocol, state, event, "failed", **changes)

@@ -25,11 +25,14 @@ class UsualTime:
 
     seconds: float
     longest_s: float
-    source: str  # in words that stand in brackets
+    source: str  # a phrase that stands in brackets
 
 
 def usual_time(protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes) -> UsualTime | None:
-    """From earlier runs of this site; before the first, from the protocol or the time for a view; None: not known."""
+    """Return how long a step usually takes; None if that is not known.
+
+    Earlier runs of this site say it; before the first, the protocol or the time for a view does.
+    """
     known = earlier.get(step.id, ())
     if known:
         runs = f"{len(known)} earlier runs" if len(known) > 1 else "one earlier run"
@@ -72,7 +75,7 @@ def work_words(
 def away_words(
     protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str, clock: Callable[[str], str]
 ) -> str:
-    """Until when nobody is asked for anything, if all goes as usual; "" if somebody is needed now or before long."""
+    """Return until when nobody is needed, if all goes as usual; "" if somebody is needed now or before long."""
     now = state.step
     if state.status != "active" or now.phase not in ("running", "checking") or needs_leave(protocol, state):
         return ""
@@ -144,14 +147,14 @@ _TIMES = ("never", "once", "twice")
 
 
 def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str] = time_utc) -> str:
-    """`b001 failed twice: no file within 46 s; third try at 20:41:07 UTC`, while the run tries again by itself.
+    """Return `b001 failed twice: no file within 46 s; third try at 20:41:07 UTC` while the run tries again by itself.
 
-    "" where nothing has failed, or where a person decides whether there is another try.
+    The text is "" where nothing has failed, or where a person decides whether there is another try.
 
     Args:
-        protocol: of the run.
-        state: of the run.
-        clock: a recorded time in words.
+        protocol: the run's protocol.
+        state: the run's state.
+        clock: turns a recorded time into text.
     """
     tries, now = state.step.tries, state.step
     if tries is None or state.status != "active" or needs_leave(protocol, state):

@@ -91,7 +91,7 @@ class Lifecycle:
         return self._targets
 
     def may(self, state: str, trigger: str) -> bool:
-        """Whether the table has this transition."""
+        """Return whether the table has this transition."""
         return (state, trigger) in self._targets
 
     def next(self, state: str, trigger: str) -> str:

@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Versions(Generic[Value]):
-    """What all versions of a mapping share: the values of each key, with the version that added each."""
+    """The part that all versions of a mapping share: the values of each key, with the version that added each."""
 
     values: dict[str, list[tuple[int, Value]]] = field(default_factory=dict[str, list[tuple[int, Value]]])
     newest: int = 0

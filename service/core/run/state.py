@@ -30,23 +30,23 @@ def lane_of(priority: int) -> Lane:
 class Loss:
     """The end of a connection to an arm, after which nobody has looked at it yet."""
 
-    seq: int  # of the newest event that tells of it: what a person answers
+    seq: int  # of the newest event that reports it: what a person answers
     since_utc: str  # of the first loss since somebody looked
-    how: str  # in words that follow a time: `when its driver's process ended (died of SIGKILL)`
+    how: str  # a phrase that follows a time: `when its driver's process ended (died of SIGKILL)`
 
 
 @dataclass(frozen=True, slots=True)
 class ArmConnection:
-    """What the record says of the connection to one arm. An arm whose connection was lost counts as moving.
+    """The recorded state of the connection to one arm. An arm whose connection was lost counts as moving.
 
     Attributes:
-        connected: whether it was opened, and no later event says that the connection has ended.
-        loss: set until a person has looked.
-        lost_utc: when a connection to it was lost last; "" if none was.
-        refused_utc: when it could not be connected; "" once it was.
-        refused_why: what the driver said then.
-        seen_by: who has looked at it since it was lost.
-        seen_utc: when.
+        connected: true if it was opened, and no later event says that the connection has ended.
+        loss: the loss of the connection, until a person has looked.
+        lost_utc: the time when a connection to it was last lost; "" if none was.
+        refused_utc: the time when it could not be connected; "" once it was.
+        refused_why: the driver's reason then.
+        seen_by: the person who has looked at it since it was lost.
+        seen_utc: the time when they looked.
     """
 
     connected: bool = False
@@ -142,7 +142,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class FailedTries:
-    """What failed last in a step and has not succeeded since, while nobody has decided anything."""
+    """The last failure in a step that has not succeeded since, while nobody has decided anything."""
 
     what: str  # a viewpoint; "": the work of the step as a whole
     times: int
@@ -190,7 +190,7 @@ class StepState:
     failure: Failure | None = None
     tries: FailedTries | None = None
     failures: int = 0  # consecutive failures without a captured viewpoint or a confirmation in between
-    # Viewpoints, notes and jobs are kept by a retry and cleared by a redo.
+    # Viewpoints, notes and jobs stay after a retry and cleared by a redo.
     captured: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → seq of its event
     viewpoint_failures: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → times
     skipped_viewpoints: tuple[str, ...] = ()  # given up
@@ -211,12 +211,12 @@ class StepState:
 
     @property
     def passed_its_gates(self) -> bool:
-        """Whether the step passed with its figures within limits or accepted; a skipped step did not."""
+        """True if the step passed with its figures within limits or accepted; a skipped step did not."""
         return self.phase == "passed" and (self.gates_passed or self.accepted is not None) and not self.skipped
 
     @property
     def mend(self) -> Mending | None:
-        """What would bring this attempt within limits, by its newest note with `advice`; None without one.
+        """The way to bring this attempt within limits, by its newest note with `advice`; None without one.
 
         Advice in earlier notes is out of date and is ignored, `hands` included.
         """
@@ -228,7 +228,7 @@ class StepState:
 
     @property
     def in_course(self) -> Mending | None:
-        """What the step asks for in its normal course before it can be judged; None where something went wrong."""
+        """The step's request in its normal course before it can be judged; None where something went wrong."""
         mend = self.mend if self.phase == "recovering" and self.failure is None else None
         return mend if mend is not None and mend.does else None
 
@@ -276,7 +276,7 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """Who gave leave for the robot to move, and in which event."""
+    """The person who gave leave for the robot to move, and the event in which they did."""
 
     seq: int
     by: str
@@ -368,12 +368,12 @@ class RunState:
 
     @property
     def started(self) -> bool:
-        """Whether run_started has been recorded."""
+        """True if run_started has been recorded."""
         return self.seq > 0
 
     @property
     def paused(self) -> bool:
-        """Whether an operator has paused the run."""
+        """True if an operator has paused the run."""
         return self.status == "paused"
 
     @property
@@ -383,7 +383,7 @@ class RunState:
 
     @property
     def terminal(self) -> bool:
-        """Whether the run has ended, completed or aborted."""
+        """True if the run has ended, completed or aborted."""
         return self.status in ("completed", "aborted")
 
     @property

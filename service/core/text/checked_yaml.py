@@ -303,7 +303,7 @@ def refuse(
     """Raise `error` listing every problem in the order of its line.
 
     Args:
-        problems: at least one.
+        problems: the problems, one or more.
         what: the kind of file, such as "protocol".
         name: the file's name.
         remedy: what the reader should do.

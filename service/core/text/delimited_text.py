@@ -58,9 +58,9 @@ class TextTable:
     """The fields of a file.
 
     Attributes:
-        rows: without empty lines and comments; numbers have a decimal point, however the file writes them.
+        rows: the rows without empty lines and comments; numbers have a decimal point, however the file writes them.
         comments: lines that begin with #, without it; programs write their header so.
-        dialect: of the file.
+        dialect: the file's way of writing fields.
     """
 
     rows: tuple[TextRow, ...]
@@ -108,7 +108,7 @@ def _unmarked(data: bytes) -> str:
 
 
 def is_number(cell: str) -> bool:
-    """Whether a field is a number with a decimal point or none."""
+    """Return whether a field is a number with a decimal point or none."""
     return _PLAIN.fullmatch(cell) is not None
 
 
@@ -158,7 +158,7 @@ def _empty_at_end(cells: Sequence[str]) -> int:
 
 
 def splitter(dialect: TextDialect) -> Callable[[str], tuple[str, ...]]:
-    """What splits a line into its fields, whose numbers it writes with a decimal point. It raises csv.Error."""
+    """Return what splits a line into its fields and gives their numbers a decimal point. It raises csv.Error."""
 
     def split(line: str) -> tuple[str, ...]:
         cells = [cell.strip() for cell in _cells(line, dialect.separator)]
@@ -178,10 +178,10 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def dialect_of(lines: Sequence[str], where: str, *, separator: str = "") -> TextDialect:
-    """How these lines, or the first of many, write their fields. `separator`: as the file states it.
+    """Return how these lines, or the first of many, write their fields. `separator`: the one that the file gives.
 
     Raises:
-        DataError: decimal commas cannot be told from separators or from marks of thousands.
+        DataError: decimal commas cannot be distinguished from separators or from marks of thousands.
     """
     found = separator or _separator(lines)
     rows = [[cell.strip() for cell in _lenient(line, found)] for line in lines]
@@ -193,7 +193,7 @@ def dialect_of(lines: Sequence[str], where: str, *, separator: str = "") -> Text
 def _lenient(line: str, separator: str) -> list[str]:
     try:
         return _cells(line, separator)
-    except csv.Error:  # told with its line when the rows are read
+    except csv.Error:  # reported with its line when the rows are read
         return []
 
 

@@ -45,7 +45,7 @@ def parse_json(text: str | bytes, *, name: str, remedy: str = "Correct the file"
     Args:
         text: the document; bytes are decoded as UTF-8, with or without a byte order mark.
         name: the file's name in errors.
-        remedy: what an error tells the reader to do.
+        remedy: the advice of an error to the reader.
 
     Raises:
         DataError: not UTF-8, not JSON, a name given twice in an object, or nested more than 100 deep.
@@ -83,7 +83,7 @@ def _integer(digits: str) -> int | float:
 
 
 def _is_deep(document: object) -> bool:
-    """Whether a document is nested deeper than MOST_DEEP; iterative, because recursion could overflow."""
+    """Return whether a document is nested deeper than MOST_DEEP; iterative, because recursion could overflow."""
     level: list[object] = [document]
     for _ in range(MOST_DEEP + 1):
         level = [

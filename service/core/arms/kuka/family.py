@@ -42,14 +42,14 @@ def lbr(
     speeds_deg_s: tuple[float, ...],
     payload_kg: float,
 ) -> ArmModel:
-    """An LBR.
+    """Return the model of an LBR.
 
     Args:
-        name: as the controller states it.
+        name: the arm's name as the controller gives it.
         offsets_m: base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange.
         limits_deg: (7,) range of each joint to each side.
-        speeds_deg_s: (7,) of the joints.
-        payload_kg: on the flange.
+        speeds_deg_s: (7,) largest speeds of the joints.
+        payload_kg: the largest load on the flange.
     """
     base, upper, fore, hand = offsets_m
     return ArmModel(

@@ -12,7 +12,7 @@ Identified = Literal["", "claimed", "password", "pin", "badge"]
 
 
 class OperatorAction(Record):
-    """What a person did. `automatic` marks a confirmation given by --auto-confirm on a simulated rig."""
+    """A person's action. `automatic` marks a confirmation given by --auto-confirm on a simulated rig."""
 
     kind: Literal["operator_action"] = "operator_action"
     action: OperatorVerb
@@ -52,11 +52,11 @@ class RobotSeen(Record):
 
     kind: Literal["robot_seen"] = "robot_seen"
     device: str  # name in rig.yaml
-    lost_seq: int = 0  # of the event that told of the loss; 0: the program had ended, which no event told yet
+    lost_seq: int = 0  # of the event that reported the loss; 0: the program had ended, which no event had reported
 
 
 class ControlTaken(Record):
-    """From now on only one screen may act on the run; the others may only watch."""
+    """One screen took control of the run: from now on only it may act on the run; the others may only watch."""
 
     kind: Literal["control_taken"] = "control_taken"
     screen: str  # name of the sign-in whose screen it is; "" when control was given back

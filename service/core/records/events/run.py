@@ -75,7 +75,7 @@ class LeaveLapsed(Record):
     leave_seq: int  # of the event that gave it
     idle_s: float  # without visible progress since then, or since the last progress
     limit_s: float  # of the protocol: motion.confirmed_for_s
-    why: str = ""  # what the run had waited for, in words; "" if it is not known
+    why: str = ""  # what the run had waited for, as a sentence; "" if it is not known
 
 
 class RunCompleted(Record):
@@ -206,7 +206,7 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metr
 
 
 class RecordedView(Record):
-    """What the record holds for every photograph, whether taken by robot, by hand or imported."""
+    """The record of every photograph, whether taken by robot, by hand or imported."""
 
     step: str
     attempt: int
@@ -219,7 +219,7 @@ class RecordedView(Record):
 
 
 class FurtherExposure(Record):
-    """What a further camera exposed at the same viewpoint, after the first one."""
+    """The exposure of a further camera at the same viewpoint, after the first one."""
 
     device: str  # name in rig.yaml
     mounted: Literal["fixed", "rigid"]  # in the room, or beside the first camera
@@ -246,7 +246,7 @@ class ViewpointCaptured(RecordedView):
     clock_offset_s: float  # controller time minus host monotonic
     further: tuple[FurtherExposure, ...] = ()  # of the rig's further cameras that exposed here
     ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
-    T_flange_tcp: Matrix4 | None = None  # the tool that the controller held; None: it did not tell
+    T_flange_tcp: Matrix4 | None = None  # the tool that the controller held; None: it did not report it
     payload_kg: float | None = None  # that the controller reckoned with
     payload_centre_m: tuple[float, float, float] | None = None  # its centre of gravity in the flange frame
 

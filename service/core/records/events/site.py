@@ -140,7 +140,7 @@ class DataRestored(Record):
 
 
 class RecordRebuilt(Record):
-    """Database or journal was overwritten, cut or lost, and was made again from the other; the old files are kept."""
+    """Database or journal was overwritten, cut or lost, and was made again from the other; the old files remain."""
 
     kind: Literal["record_rebuilt"] = "record_rebuilt"
     made: Literal["database", "journal"]  # what was made again
