@@ -141,11 +141,11 @@ class BoardCapture:
 
         Args:
             count: the most poses to add.
-            enough: from the predictions without and with further poses, whether these are enough.
-            advise: the advice to the operator, from the number of poses, their names and their prediction in words.
+            enough: says from the predictions without and with further poses if these are enough.
+            advise: returns the advice to the operator for a number of poses, their names and the predicted result.
 
         Returns:
-            whether any pose was found.
+            True if any pose was found.
         """
         looks = self.looks()
         return bool(self._plan("mend", count, looks, enough=enough, advise=advise))
@@ -159,7 +159,7 @@ class BoardCapture:
         enough: Callable[[PlanPrediction, PlanPrediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
     ) -> tuple[Viewpoint, ...]:
-        """Plan board poses, record them and tell the operator; none if the arm can reach no other useful pose."""
+        """Plan board poses, record and report them; none if the arm can reach no other useful pose."""
         self.context.progress("planning board poses", 0, 1)
         self.context.busy("planning board poses")
         known = self._knowledge(looks)
@@ -186,7 +186,7 @@ class BoardCapture:
         from_images: int,
         advise: Callable[[int, str, str], str] | None,
     ) -> None:
-        """Record planned poses with what they are predicted to give, and tell the operator."""
+        """Record planned poses with what they are predicted to give, and report them to the operator."""
         prediction = prediction_record(predicted)
         words = describe_prediction(prediction, self.solve)
         names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
@@ -223,7 +223,7 @@ class BoardCapture:
         )
 
     def _feasible(self, known: BoardKnowledge) -> Callable[[Transform], bool]:
-        """Whether the arm can reach T_base_camera; always, for an arm of unknown kinematics."""
+        """Return a test if the arm can reach T_base_camera; it is always true for an arm of unknown kinematics."""
         arm = arm_at_station(self.context, self.wanted.station, self._mount)
         if arm is None:
             return lambda _T: True
@@ -350,7 +350,7 @@ def _middle(known: BoardKnowledge, board: Board) -> Array:
 
 
 def _same_base(before: Sequence[SearchedBoardImage], station: str, seen: Sequence[SearchedBoardImage]) -> bool:
-    """Whether an earlier step's images were taken from this station."""
+    """Return whether an earlier step's images were taken from this station."""
     return all(look.capture.station == station for look in (*before, *seen))
 
 

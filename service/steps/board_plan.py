@@ -50,12 +50,12 @@ class Planner:
     """Plans board poses at one station.
 
     Attributes:
-        wanted: by the protocol.
-        board: to be photographed.
-        aims: calibrations that the images are for.
+        wanted: the protocol's section on board poses.
+        board: the board to be photographed.
+        aims: the calibrations that the images are for.
         approach: (3,) horizontal unit vector from the scene towards the arm's base.
         nominal_mount: T_flange_camera according to the drawing.
-        feasible: whether the arm can reach a T_base_camera given for the nominal mount.
+        feasible: says if the arm can reach a T_base_camera given for the nominal mount.
     """
 
     wanted: BoardPoses
@@ -75,7 +75,7 @@ class Planner:
         enough: Callable[[PlanPrediction], bool] | None = None,
         seed: int = 0,
     ) -> PlannedBoard:
-        """Up to `count` further poses; fewer if the arm can reach no others that show the board."""
+        """Plan up to `count` further poses; fewer if the arm can reach no others that show the board."""
         wishes = FIRST if why == "first" else self.wanted.wishes
         problem = self._problem(known)
         poses = np.zeros((0, 4, 4))
@@ -142,11 +142,11 @@ def nominal_board(
 
 
 def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None) -> tuple[CameraModel, float]:
-    """Nominal intrinsics without distortion, and the relative uncertainty of the focal length.
+    """Return nominal intrinsics without distortion, and the relative uncertainty of the focal length.
 
     Args:
-        lens: of the rig file; None: a common focal length with a large uncertainty.
-        size: of the images, px; None: as the rig file states it.
+        lens: the lens of the rig file; None: a common focal length with a large uncertainty.
+        size: width and height of the images, px; None: as the rig file gives them.
     """
     width, height = size or (lens.image_px if lens is not None else (1800, 1200))
     if lens is None:

@@ -11,7 +11,7 @@ from service.core.records.base import Elapsed, Moment, elapsed
 from service.core.run.state import RunState
 from service.steps.kinds import scan_import, timed_application
 
-_SHOWN_S = 60.0  # the time left is told in whole minutes
+_SHOWN_S = 60.0  # the time left is shown in whole minutes
 _CLOSE_S, _SHOWN_CLOSE_S = 300.0, 10.0  # and in steps of ten seconds when there is little of it
 
 
@@ -20,12 +20,12 @@ class Coat:
     """A coat on the specimen, while a scan of it is still to come.
 
     Attributes:
-        product: what was applied.
-        scan: title of the step that imports the scan.
-        within_s: age at which the scan must have arrived: the limit of that step's gate, else of the application.
-        gated: whether a gate of the protocol judges the age.
-        sublimates_after_s: age at which it has disappeared.
-        age: as the gate will judge it; not known where the clocks contradict each other.
+        product: the name of what was applied.
+        scan: the title of the step that imports the scan.
+        within_s: the age at which the scan must have arrived: the limit of that step's gate, else of the application.
+        gated: true if a gate of the protocol judges the age.
+        sublimates_after_s: the age at which it has disappeared.
+        age: the age as the gate will judge it; not known where the clocks contradict each other.
         at_utc: the time for which this holds.
     """
 
@@ -62,7 +62,7 @@ class Coat:
 
     @property
     def text(self) -> str:
-        """What that means for the scan."""
+        """The consequence of the coat's age for the scan, as a sentence."""
         limit = f"{self.within_s / 60:g} min"
         if self.age.seconds is None:
             then = f" The limit of {limit} will not count as met." if self.gated else ""

@@ -119,7 +119,7 @@ class Devices(Protocol):
         ...
 
     def layout(self, station: str) -> StationLayout:
-        """Which arm and scene a station has."""
+        """Return the arm and the scene of a station."""
         ...
 
     def nominal_T_flange_camera(self) -> Transform:
@@ -143,7 +143,7 @@ class Devices(Protocol):
         ...
 
     def let_move(self, leave: LeaveToMove) -> None:
-        """Let the arms move: each arm is told once, when `robot` next asks for it."""
+        """Let the arms move: each arm gets the leave once, when `robot` next asks for it."""
         ...
 
     def reopen(self, device: Device) -> None:
@@ -151,7 +151,7 @@ class Devices(Protocol):
         ...
 
     def hold_arms(self) -> None:
-        """Stop and close every open arm: it moves again only after it is opened anew and a person has confirmed."""
+        """Stop and close every open arm: it moves again only after it is reopened and a person has confirmed."""
         ...
 
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
@@ -176,15 +176,15 @@ class JobRequest:
         references: Mapping[str, Reference | Each | None] = _NO_REFERENCES,
         priority: int = WAITED,
     ) -> JobRequest:
-        """A request with typed arguments.
+        """Return a request with typed arguments.
 
         Args:
-            kind: of the job.
-            arguments: with values, also where they come from earlier jobs.
-            references: field of the arguments (`camera`, `registrations/colmap`, `further_arms/0/arm_correction`) →
-                the reference that is recorded instead of its value; None where no job computed the value, which is
-                then recorded itself.
-            priority: see service.core.run.state.
+            kind: the job's kind.
+            arguments: the values, also where they come from earlier jobs.
+            references: the reference that is recorded instead of a value, by the argument's field (`camera`,
+                `registrations/colmap`, `further_arms/0/arm_correction`); None where no job computed the value;
+                the value itself is then recorded.
+            priority: the job's priority (service.core.run.state).
         """
         recorded = arguments.plain()
         for path, reference in references.items():
@@ -218,7 +218,7 @@ class JobResult:
 
 
 class Evidence(Protocol):
-    """Where a step records what happens. It raises if recording fails, so that nothing is done unrecorded."""
+    """A step's access to the record. It raises if recording fails, so that nothing is done unrecorded."""
 
     def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "") -> None:
         """Append events (and artefact rows) in one transaction."""
@@ -237,7 +237,7 @@ class Evidence(Protocol):
         ...
 
     def holds(self, sha256: str) -> bool:
-        """Whether a file with these bytes is in the evidence of this run already."""
+        """Return whether a file with these bytes is in the evidence of this run already."""
         ...
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
@@ -253,11 +253,11 @@ class Evidence(Protocol):
         ...
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """What people have asked of this step on the pages so far, in order."""
+        """Return the requests of people to this step on the pages so far, in order."""
         ...
 
     def computing(self) -> bool:
-        """Whether a worker computes a job of this run at this moment."""
+        """Return whether a worker computes a job of this run at this moment."""
         ...
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
@@ -289,7 +289,7 @@ class StepContext:
     wait: Callable[[float], None]
     operator: str
     tell: Callable[[str], None]  # one line of news for the operator
-    moment: Callable[[], Moment]  # now, in both clocks: for times that are kept and compared later
+    moment: Callable[[], Moment]  # now, in both clocks: for times that are stored and compared later
     # Surrounds each motion of an arm; raises StepInterruptedError if nobody has let it move for too long.
     motion: Callable[[], AbstractContextManager[None]]
     wait_for_results: Callable[[float], None]  # as `wait`, where jobs are waited for
@@ -307,7 +307,7 @@ class StepContext:
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """What a step measured (gates judge it), the files it produced, its Result, and the jobs that computed them.
+    """A step's measures (gates judge them), the files it produced, its Result, and the jobs that computed them.
 
     Audit and replay follow `computed_by` from a step's numbers to the jobs: name each job whose measures are given.
     """
@@ -321,7 +321,7 @@ class StepOutcome:
 
 @dataclass(frozen=True, slots=True)
 class BeforeStep:
-    """What a kind's announcement may mention: title, number of images still to take, and stations."""
+    """The facts that a kind's announcement may mention: title, number of images still to take, and stations."""
 
     title: str
     views_left: int
@@ -329,7 +329,7 @@ class BeforeStep:
 
     @property
     def at_stations(self) -> str:
-        """` at station 1`, or "" without stations."""
+        """The phrase ` at station 1`, or "" without stations."""
         return f" at {self.stations}" if self.stations else ""
 
     def images(self, of: str = "") -> str:
@@ -339,7 +339,7 @@ class BeforeStep:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """What a confirmation starts: the text of its button after `Confirm: `, and a line below it."""
+    """The effect of a confirmation: the text of its button after `Confirm: `, and a line below it."""
 
     does: str
     below: str = "Nothing moves."
@@ -353,15 +353,15 @@ class StepKind(Generic[P]):
     """One kind of step, declared once.
 
     Attributes:
-        name: in the protocol.
-        params: its section of the protocol.
-        measures: the numbers that it yields, for gates.
-        result: what it leaves to later steps.
-        execute: does it.
+        name: the kind's name in the protocol.
+        params: the type of its section of the protocol.
+        measures: the type of the numbers that it yields, for gates.
+        result: the type of what it leaves to later steps.
+        execute: does the step.
         registered_by: the step whose registrations the measures are of, where they are RegistrationMeasures; None:
             this step itself.
-        words: what a person reads before confirming it.
-        drawing: shown beside the instructions if the protocol names no other: the name of one in
+        words: returns what a person reads before confirming it.
+        drawing: the drawing beside the instructions if the protocol names no other: the name of one in
             service/web/run/drawings, or, for a kind of a plug-in, an SVG itself (`<svg …`).
     """
 

@@ -27,12 +27,12 @@ class _Evaluated(JobRecord):
 
 
 def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None) -> dict[str, Task]:
-    """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration.
+    """Return the evaluation jobs of registrations that arrived after the step's own evaluation, by registration.
 
     Args:
-        state: of the run.
+        state: the run's state.
         step: the evaluation.
-        found: the jobs of the registration step that it evaluates, as recorded; None if that has not begun them.
+        found: the recorded jobs of the registration step that it evaluates; None if that has not started them.
     """
     if step.gives != "accuracy" or state.steps[step.id].skipped:
         return {}
@@ -139,14 +139,14 @@ def duration_words(seconds: float) -> str:
 def missing_results(
     protocol: Protocol, state: RunState, started_utc: Mapping[str, str], now_utc: str, cores: int
 ) -> list[PendingResult]:
-    """The planned results that have not arrived, in the order in which they are expected.
+    """Return the planned results that have not arrived, in the order in which they are expected.
 
     Args:
-        protocol: of the run.
-        state: of the run.
-        started_utc: when each job that is being computed now was started, by job id.
+        protocol: the run's protocol.
+        state: the run's state.
+        started_utc: the start of each job that is being computed now, by job id.
         now_utc: the present time.
-        cores: number of jobs computed in parallel.
+        cores: the number of jobs computed in parallel.
     """
     left: list[PendingResult] = []
     for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run

@@ -40,7 +40,7 @@ class FurtherImage:
 
     @property
     def rigid(self) -> bool:
-        """Whether the camera moves with the arm."""
+        """True if the camera moves with the arm."""
         return self.taken_by.section.mounted == "rigid"
 
 
@@ -131,17 +131,17 @@ class _Tool(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """What an exposure at a viewpoint needs.
+    """The devices and settings that an exposure at a viewpoint needs.
 
     Attributes:
-        camera: takes the image.
-        robot: holds the camera, and streams its pose.
-        viewpoint: at which the arm stands.
-        settled: how it came to rest.
+        camera: the camera that takes the image.
+        robot: the arm that holds the camera, and streams its pose.
+        viewpoint: the viewpoint at which the arm stands.
+        settled: the report on how it came to rest.
         environment: light and temperature before the exposure.
-        wanted: settings of the protocol.
-        image_kind: artefact kind of the photograph.
-        further: cameras that expose after it, while the arm stands.
+        wanted: the protocol's settings.
+        image_kind: the artefact kind of the photograph.
+        further: the cameras that expose after it, while the arm stands.
     """
 
     camera: Camera
@@ -285,10 +285,10 @@ def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_
     """Release the shutter. While the camera is busy with an earlier image, try again for up to a minute.
 
     Args:
-        context: of the step.
-        camera: that takes the image.
-        folder: for its files.
-        was_busy: it was busy for a minute already: try for a few seconds only.
+        context: the step's surroundings: devices, evidence, clock.
+        camera: the camera that takes the image.
+        folder: the files' folder.
+        was_busy: true if it was busy for a minute already: then try for a few seconds only.
     """
     for pause_s in _BUSY_AGAIN_PAUSES_S if was_busy else _BUSY_PAUSES_S:
         try:
@@ -331,7 +331,7 @@ def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
 
 
 def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
-    """Whether an image's EXIF shows the protocol's settings: ISO exactly, aperture and time up to rounding."""
+    """Return whether an image's EXIF has the protocol's settings: ISO exactly, aperture and time up to rounding."""
     return (
         agrees(actual.aperture_f, wanted.aperture_f)
         and agrees(actual.exposure_s, wanted.exposure_s)

@@ -1,4 +1,4 @@
-"""Guides a capture by hand: its parameters and measures, what its jobs are given, and what the person is told."""
+"""Guides a capture by hand: its parameters and measures, what its jobs are given, and what the person reads."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ class Ring(Record):
 
 
 class Params(StepParams):
-    """What the images are for, and where they should be taken from."""
+    """The purpose of the images, and the places from which they should be taken."""
 
     by_hand: ClassVar = True
     repeated: ClassVar = RepeatedStep("Take the images that are missing or would help; the others are kept")
 
     purpose: Literal["dataset", "control", "calibration"]  # what the images are for
     hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # where images are to be taken from
-    prefix: str = "h_"  # of the views' names
+    prefix: str = "h_"  # the beginning of the views' names
     min_images: Annotated[int, Field(ge=3)] = 12  # usable images that are needed at least
     max_images: Annotated[int, Field(ge=3)] = 200  # including unusable ones
     # Step with the intrinsics; not for images of the board.
@@ -81,12 +81,12 @@ class Params(StepParams):
 
     @property
     def photographs_specimen(self) -> bool:
-        """Whether the images are not of the calibration board."""
+        """True unless the images are of the calibration board."""
         return self.purpose != "calibration"
 
 
 class Measures(PredictedMeasures):
-    """Of the images so far."""
+    """The measures of the images so far."""
 
     images_taken: Annotated[Count, "photographs taken"] = None
     images_used: Annotated[Count, "photographs that can be used"] = None
@@ -97,7 +97,7 @@ class Measures(PredictedMeasures):
 
 
 class Result(Record):
-    """Which images are used."""
+    """The images that are used, and those that are not."""
 
     purpose: str
     used: tuple[str, ...]
@@ -113,10 +113,10 @@ class CommonArguments:
 
 
 def common_arguments(context: StepContext, params: Params) -> CommonArguments:
-    """The arguments that all jobs of the step have in common.
+    """Return the arguments that all jobs of the step have in common.
 
     Raises:
-        ConfigurationError: the protocol lacks the board, the calibration or the spheres that the images need.
+        ConfigurationError: the protocol does not name the board, the calibration or the spheres that the images need.
     """
     return _of_board(context, params) if params.purpose == "calibration" else _of_specimen(context, params)
 
@@ -240,7 +240,7 @@ def failure_words(job: JobState) -> str:
 
 @dataclass
 class Guide:
-    """Enqueues a job for one image after the other, and tells the person the result."""
+    """Enqueues a job for one image after the other, and shows the person the result."""
 
     context: StepContext
     params: Params
@@ -249,7 +249,7 @@ class Guide:
 
     @property
     def kind(self) -> str:
-        """Kind of the jobs."""
+        """The kind of the jobs."""
         return (hand_board if self.params.purpose == "calibration" else hand_view).KIND.name
 
     def begin(self) -> None:
@@ -266,7 +266,7 @@ class Guide:
         self._say(_answer_of(done[-1]).words if done else self.shared.values.first_words)
 
     def look(self) -> None:
-        """Tell the result of the last image, and enqueue the job for the next one. Returns at once."""
+        """Show the result of the last image, and enqueue the job for the next one. Returns at once."""
         jobs = {image_of(job).sha256: job for job in self._jobs()}
         for view in self._views():
             job = jobs.get(view.artefacts[0].sha256)
@@ -284,7 +284,7 @@ class Guide:
                 self.context.tell(failure_words(job))
 
     def __post_init__(self) -> None:
-        # The results of jobs that ended before a restart were told then.
+        # The results of jobs that ended before a restart were shown then.
         self._reported = {job.job for job in self._jobs() if job.status != "enqueued"}
 
     def images_used(self) -> int:
@@ -292,7 +292,7 @@ class Guide:
         return int(self._measures().get("images_used", 0))
 
     def enough(self) -> bool:
-        """Whether every image was analysed and the step's gates pass, or there are too many images."""
+        """Return whether every image was analysed and the step's gates pass, or there are too many images."""
         views = self._views()
         if len(self._answers()) + sum(job.status == "failed" for job in self._jobs()) < len(views):
             return False

@@ -96,9 +96,10 @@ def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
 
 
 def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[PosedPhotograph]:
-    """Every valid photograph of the given capture steps with its pose, in the order of capture.
+    """Return every valid photograph of the given capture steps with its pose, in the order of capture.
 
-    Read from the evidence, because the context's state lacks events since the step began, such as its own images.
+    They are read from the evidence, because the context's state does not have the events since the step began, such
+    as the step's own images.
     """
     images: list[PosedPhotograph] = []
     for step_id in step_ids:
@@ -170,7 +171,7 @@ def with_robot_pose(photograph: PosedPhotograph, view: RecordedView) -> PosedPho
 
 
 def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer]:
-    """What the worker found in the hand-held images of a step, by the SHA-256 of the photograph.
+    """Return the worker's findings in the hand-held images of a step, by the SHA-256 of the photograph.
 
     Without a CT, each new image refines the poses of all: the newest ones are used.
     """
@@ -201,14 +202,14 @@ class CameraMounting:
 
 
 def mounting_of(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> CameraMounting:
-    """What turns robot poses into camera poses (service/worker/inputs.py).
+    """Return what turns robot poses into camera poses (service/worker/inputs.py), with the references to it.
 
     A correction belongs to one arm: it is given with the stations at which that arm stood.
 
     Args:
-        context: of the step.
+        context: the step's surroundings: devices, evidence, clock.
         step_ids: the hand-eye calibrations; those after the first are of further arms.
-        stations: of the images.
+        stations: the stations at which the images were taken.
     """
     first, *further = step_ids
     at = sorted(set(stations))

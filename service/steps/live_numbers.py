@@ -36,10 +36,10 @@ def look_at_further(
     """Enqueue the job on every new image of a further camera in this step. Returns at once.
 
     Args:
-        context: of the capture step.
-        spheres_m: centres in the CT.
-        radius_m: of the spheres.
-        references: what is recorded instead of `spheres_m`.
+        context: the capture step's surroundings: devices, evidence, clock.
+        spheres_m: the spheres' centres in the CT.
+        radius_m: the spheres' radius.
+        references: the references that are recorded instead of `spheres_m`.
     """
     jobs = context.evidence.jobs(context.step.id)
     begun = {image_of(job).sha256 for job in jobs if job.kind == further_view.KIND.name}
@@ -95,7 +95,7 @@ class CoverageRule(Record):
 
 
 class LiveParams(Record):
-    """What the numbers after each image are computed from, and how."""
+    """The steps and limits that the numbers after each image are computed from."""
 
     calibration: Annotated[str, NAMES_CALIBRATION]  # step with the intrinsics
     hand_eye: Annotated[str, NAMES_CALIBRATION]  # step with T_flange_camera
@@ -144,7 +144,7 @@ class LiveAnalysis:
         return analysis
 
     def look(self) -> None:
-        """Enqueue the job on every new image, and tell the numbers of earlier ones. Returns at once."""
+        """Enqueue the job on every new image, and show the numbers of earlier ones. Returns at once."""
         begun = {image_of(job).sha256 for job in self._jobs("live_view")}
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
@@ -168,13 +168,13 @@ class LiveAnalysis:
     def summary(
         self, station: str, candidates: Sequence[tuple[Viewpoint, float]], retakes: str = "", again: int = 0
     ) -> dict[str, float]:
-        """Wait for the last images while their jobs go on; the measures. If a gate fails, suggest further views.
+        """Wait for the jobs on the last images; return the measures. If a gate fails, suggest further views.
 
         Args:
-            station: of the robot.
+            station: the robot's station.
             candidates: further viewpoints at this station, with the travel time (s).
-            retakes: advice on images to take again, to which the suggestion is added.
-            again: number of images to take again.
+            retakes: the advice on images to take again, to which the suggestion is added.
+            again: the number of images to take again.
         """
         self._wait()
         error_gate, coverage_gate = self._gate(ERROR), self._gate(COVERAGE)
@@ -261,7 +261,7 @@ class LiveAnalysis:
             f"{short}. {confirm} {len(suggestions)} more views ({names}): the error is then predicted to be "
             f"{last.predicted_error_mm:.3f} mm and the coverage {100 * last.coverage:.0f} %"
         )
-        self.context.tell(advice)  # the advice on retakes was told before
+        self.context.tell(advice)  # the advice on retakes was shown before
         # Pages show the newest note with advice, so it must hold everything that the confirmation does.
         both = f"{retakes}. {advice}" if retakes else advice
         # This note replaces that of the retakes, so it repeats what has to be done for them.
@@ -388,7 +388,7 @@ class SharedArguments:
 
     @classmethod
     def of(cls, context: StepContext, params: LiveParams) -> SharedArguments:
-        """From the results of earlier steps. Raises ConfigurationError if one is missing."""
+        """Read the arguments from the results of earlier steps. Raises ConfigurationError if one is missing."""
         scan = earlier_answer(context, params.spheres_of, locate_spheres.KIND)
         calibration = earlier_answer(context, params.calibration, calibrate.KIND)
         hand_eye = earlier_answer(context, params.hand_eye, calibrate.KIND)
@@ -421,7 +421,7 @@ class SharedArguments:
         )
 
     def arguments(self, mounting: Mounting) -> live_view.LiveArguments:
-        """What the arguments of all jobs share, with the mounting at a station."""
+        """Return what the arguments of all jobs share, with the mounting at a station."""
         return live_view.LiveArguments(
             camera=self.camera,
             **mounting.set_fields(),

@@ -135,7 +135,7 @@ Deg = Annotated[float | None, Measure("°", 0, 360)]
 
 
 class LayoutMeasures(MeasureRecord):
-    """Of the layout of the spheres: whether one set of spheres could be mistaken for another."""
+    """The measures of the layout of the spheres: whether one set of spheres could be mistaken for another."""
 
     layout_margin_mm: Annotated[
         FineMm, "misfit of the best wrong assignment of four spheres: how far they are from being mistaken"
@@ -150,7 +150,7 @@ class LayoutMeasures(MeasureRecord):
 
 
 class SphereMeasures(LayoutMeasures):
-    """Of the spheres in a mesh, and how they moved since an earlier one."""
+    """The measures of the spheres in a mesh, and of how they moved since an earlier one."""
 
     spheres_found: Annotated[Count, "spheres found in the mesh"] = None
     radius_residual_max_mm: Annotated[
@@ -192,7 +192,7 @@ class SphereMeasures(LayoutMeasures):
 
 
 class CaptureMeasures(MeasureRecord):
-    """Of a capture by the robot."""
+    """The measures of a capture by the robot."""
 
     viewpoints_planned: Annotated[Count, "viewpoints that the step was to take"] = None
     viewpoints_captured: Annotated[Count, "viewpoints with a valid image"] = None
@@ -203,7 +203,7 @@ class CaptureMeasures(MeasureRecord):
 
 
 class PredictedMeasures(MeasureRecord):
-    """What a capture predicts of the registration, before it is computed."""
+    """The registration's accuracy and coverage, predicted by a capture before it is computed."""
 
     predicted_target_error_mm: Annotated[
         ErrorMm, "predicted error of the registration at the worst point of the specimen"

@@ -108,7 +108,7 @@ def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | 
 
 
 def _feasible(arm: ArmAtStation | None, sharp_at_m: Array) -> Callable[[Transform], bool]:
-    """Whether the arm can reach T_base_camera; always, for an unknown arm."""
+    """Return a test if the arm can reach T_base_camera; it is always true for an unknown arm."""
     if arm is None:
         return lambda _T: True
     scene = arm.scene(usual_posture(arm.model, arm.layout, arm.T_flange_camera), sharp_at_m=sharp_at_m)

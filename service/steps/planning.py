@@ -53,12 +53,12 @@ class ArmAtStation:
     """An arm of known kinematics at a station, with everything that a motion plan there depends on.
 
     Attributes:
-        layout: of the station.
-        model: kinematics of the arm.
+        layout: the station's layout.
+        model: the arm's kinematics.
         T_flange_camera: (4, 4) the best known mounting of the camera.
         collision: obstacles, and the size of the camera.
-        optics: of the lens, if the rig file describes it.
-        motion: speed, acceleration and pauses of the protocol.
+        optics: the lens, if the rig file describes it.
+        motion: the protocol's speed, acceleration and pauses.
     """
 
     layout: StationLayout
@@ -150,14 +150,14 @@ def plan_step(
     Progress is shown meanwhile, and pause and abort are heeded.
 
     Args:
-        context: of the step.
-        viewpoints: to visit.
+        context: the step's surroundings: devices, evidence, clock.
+        viewpoints: the viewpoints to visit.
         T_flange_camera: (4, 4) the best known mounting of the camera.
-        order: as listed, or the shortest way.
+        order: the order of the viewpoints: as listed, or the shortest way.
         sharp_at_m: (N, 3) points that must be sharp, base frame; None: the specimen.
 
     Raises:
-        StepInterruptedError: paused or aborted meanwhile.
+        StepInterruptedError: the step was paused or aborted meanwhile.
     """
     plans: list[StepPlan] = []
     for station in dict.fromkeys(v.station for v in viewpoints):
@@ -223,7 +223,7 @@ def plan_station(
 
 
 def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
-    """The plans of all stations as one, which is told and recorded."""
+    """Join the plans of all stations into one, record it and report it to the operator."""
     whole = StepPlan(
         tuple(v for plan in plans for v in plan.viewpoints),
         {name: reason for plan in plans for name, reason in plan.refused.items()},

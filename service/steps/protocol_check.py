@@ -52,12 +52,12 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
 def implausible(
     loaded: LoadedProtocol, rig: RigSection | None = None, devices: Mapping[str, RigDevice] = NO_DEVICES
 ) -> tuple[YamlProblem, ...]:
-    """Unknown measures, wrong units, limits that are not credible, motions too fast, unknown stations; by line.
+    """Find unknown measures, wrong units, incredible limits, too fast motions and unknown stations; sort by line.
 
     Args:
         loaded: the protocol.
         rig: the rig in which it is to run, if that is known.
-        devices: what the drivers say of the rig's devices, by name.
+        devices: the drivers' statements about the rig's devices, by name.
     """
     tree = parse_yaml(loaded.source, name="the protocol")
     found: list[tuple[FieldPath, str]] = []
@@ -106,7 +106,7 @@ def require_plausible(
 
 
 def require_devices(protocol: Protocol, rig: Rig, devices: Mapping[str, RigDevice]) -> None:
-    """Refuse a rig that lacks a device of a step which nobody may skip.
+    """Refuse a rig without a device of a step which nobody may skip.
 
     Raises:
         ConfigurationError: the message names the first such step.

@@ -57,12 +57,12 @@ class RegistrationJobs:
 def registration_jobs(
     state: RunState, step: Step, waited: Iterable[str], outlines: JobRequest, root: str
 ) -> RegistrationJobs:
-    """Every job of every registration of a step, as far as the results so far allow to plan them.
+    """Return every job of every registration of a step, as far as the results so far allow to plan them.
 
     Args:
-        state: of the run.
+        state: the run's state.
         step: the registration step.
-        waited: names of the registrations that the step waits for.
+        waited: the names of the registrations that the step waits for.
         outlines: the job that detects the spheres; the arguments of all other jobs derive from its arguments.
         root: the name of that job; jobs that use other images have another root in their names.
     """
@@ -290,5 +290,5 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
 
 
 def name_of(job: JobState) -> str:
-    """The part of a job's key that tells it from other jobs of its kind."""
+    """Return the part of a job's key that distinguishes it from other jobs of its kind."""
     return job.idempotency_key.split("/")[3]

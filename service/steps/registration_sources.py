@@ -78,7 +78,7 @@ def decisive(protocol: Protocol, step: Step) -> tuple[str, ...]:
 
 
 def most_preferred(registrations: Iterable[str]) -> str:
-    """Of several registrations the one to build on; with corrected poses of the arm if there is one."""
+    """Return the one of several registrations to build on; with corrected poses of the arm if there is one."""
     names = tuple(registrations)
     return next((name for name in _BY_PREFERENCE if name in names), names[0])
 
@@ -107,12 +107,12 @@ def _named(measure: str, names: Iterable[str]) -> list[str]:
 
 
 def posed(images: Iterable[PosedPhotograph]) -> bool:
-    """Whether the poses of any of the images are known, from a robot or from the spheres."""
+    """Return whether the pose of any of the images is known, from a robot or from the spheres."""
     return any(image.T_base_flange is not None or image.T_scene_camera is not None for image in images)
 
 
 def of_arms(images: Iterable[PosedPhotograph]) -> bool:
-    """Whether an arm carried the camera in any of the images, and no sphere says where that was."""
+    """Return whether an arm carried the camera in any of the images, and no sphere says where that was."""
     return any(image.T_base_flange is not None and image.T_scene_camera is None for image in images)
 
 

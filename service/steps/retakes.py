@@ -26,11 +26,11 @@ class ImageSharpness:
     """The sharpness of one image, as a job measured it.
 
     Attributes:
-        viewpoint: its name.
-        sha256: of the photograph.
-        edge_px: width of its clearest edges; None if it has none.
-        black: whether it is black.
-        width: of the image, px.
+        viewpoint: the viewpoint's name.
+        sha256: the photograph's SHA-256.
+        edge_px: the width of its clearest edges; None if it has none.
+        black: true if it is black.
+        width: the image's width, px.
     """
 
     viewpoint: str
@@ -41,7 +41,7 @@ class ImageSharpness:
 
     @classmethod
     def of(cls, job: JobState, *, black: bool, width: int) -> ImageSharpness:
-        """From a finished job on one image, with what its answer says of the image."""
+        """Read the sharpness from a finished job on one image; its answer gives `black` and `width`."""
         image = image_of(job)
         return cls(image.viewpoint, image.sha256, job.measures.get("image_edge_px"), black, width)
 
@@ -90,11 +90,11 @@ def spoilt_before(context: StepContext) -> set[str]:
 def row_to_stop_for(
     context: StepContext, images: Sequence[ImageSharpness], others: Sequence[ImageSharpness]
 ) -> list[ImageSharpness]:
-    """The spoilt images in a row with which a step's images end, where they are to stop it; else none.
+    """Return the spoilt images in a row with which a step's images end, if they are to stop it; else none.
 
     Args:
-        images: of the step, in the order of capture.
-        others: of earlier steps, to compare with.
+        images: the step's images, in the order of capture.
+        others: the images of earlier steps, to compare with.
     """
     if not may_stop(context):
         return []
@@ -103,7 +103,7 @@ def row_to_stop_for(
 
 
 def may_stop(context: StepContext) -> bool:
-    """Whether spoilt images may still stop the step: not again and again, for then a person has seen them."""
+    """Return whether spoilt images may still stop the step: not again and again, for then a person has seen them."""
     return sum(note.advice is not None for note in images_to_repeat(context.state, SPOILT)) < _MOST_STOPS
 
 
@@ -163,12 +163,12 @@ def advise_retakes(context: StepContext, measures: Mapping[str, float], images: 
     """If a gate on how images were taken fails, note which images a retry takes again.
 
     Args:
-        context: of the step.
-        measures: of the capture.
-        images: how many will be taken again.
+        context: the step's surroundings: devices, evidence, clock.
+        measures: the capture's measures.
+        images: the number of images that will be taken again.
 
     Returns:
-        the advice; "" if none is needed.
+        The advice; "" if none is needed.
     """
     verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
     failed = [verdict for verdict in verdicts if not verdict.passed and verdict.measure in TAKEN_AGAIN]

@@ -36,7 +36,7 @@ _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of
 
 
 class Params(MovingParams):
-    """Which board images are taken, and what is computed from them."""
+    """The board images to take, and the calibrations to compute from them."""
 
     gives: ClassVar = "calibration"
     repeated: ClassVar = RepeatedStep("Take the board images that are missing and compute again; the others are kept")
@@ -51,7 +51,7 @@ class Params(MovingParams):
 
     @property
     def moves_robot(self) -> bool:
-        """Whether new images are taken."""
+        """True if new images are taken."""
         return self.images_of is None
 
     @property
@@ -67,7 +67,7 @@ class Params(MovingParams):
 
 
 class Measures(CaptureMeasures):
-    """Of the board images, the intrinsics and the hand-eye transform."""
+    """The measures of the board images, the intrinsics and the hand-eye transform."""
 
     views: Annotated[Count, "board images that were used"] = None
     views_without_board: Annotated[Count, "board images in which no board was found"] = None
@@ -254,7 +254,7 @@ def _solve(
 
 
 def _stated_of_board(context: StepContext, camera: EarlierAnswer[calibrate.Answer] | None) -> dict[str, Any]:
-    """What the protocol states of its board, and how the calibration of the camera has seen it, where they do."""
+    """Return what the protocol and the camera's calibration say of the board, as far as they do."""
     board = context.protocol.board
     stated: dict[str, Any] = {}
     if board is not None and board.size_tolerance_percent is not None:

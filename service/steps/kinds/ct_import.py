@@ -20,7 +20,7 @@ from service.steps.measures import Count, Measure, SphereMeasures
 
 
 class Params(StepParams):
-    """What to expect from the CT suite."""
+    """The files and spheres to expect from the CT suite."""
 
     gives: ClassVar = "ct_surface"
     repeated: ClassVar = RepeatedStep("Put another series into the CT folder and import it")
@@ -39,7 +39,7 @@ class Params(StepParams):
 
 
 class Measures(SphereMeasures):
-    """Of the series, and of the spheres in its surface."""
+    """The measures of the series, and of the spheres in its surface."""
 
     slices: Annotated[Count, "slices of the series"] = None
     images_elsewhere: Annotated[

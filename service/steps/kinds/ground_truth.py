@@ -27,22 +27,23 @@ from service.steps.registration_sources import decisive
 
 
 class _Posed(Mounting):
-    """What a registration was told of its images' poses."""
+    """The images and the source of their poses, as a registration received them."""
 
     images: tuple[PosedPhotograph, ...]
     poses: str
 
 
 def with_located_images(registered: JobState, jobs: Jobs) -> JobRequest:
-    """The request of a registration, for another mesh, whose images stand where the spheres of the first placed them.
+    """Return a registration's request for another mesh, whose images stand where the first one's spheres placed them.
 
-    As it was where their poses were known before: by an arm, from a capture by hand, or by structure from motion.
+    The request is unchanged where their poses were known before: by an arm, from a capture by hand, or by structure
+    from motion.
     Otherwise each mesh would locate the images by its own spheres, in its own frame, and the two could not be
     compared.
 
     Args:
         registered: the finished job `register` of the first mesh.
-        jobs: of the run, for references.
+        jobs: the run's jobs, for references.
     """
     recorded = dict(registered.arguments)
     known = read_part(_Posed, recorded, jobs)
@@ -83,7 +84,7 @@ class WoundRegion(Record):
 
 
 class Params(StepParams):
-    """Which surfaces are fused, and how."""
+    """The surfaces that are fused, and how."""
 
     gives: ClassVar = "ground_truth"
     repeated: ClassVar = RepeatedStep("Correct the wound's region, then fuse again", same=True, device=False)
@@ -99,7 +100,7 @@ class Params(StepParams):
 
 
 class Measures(MeasureRecord):
-    """Of CT and scan in one frame, and of the fused mesh."""
+    """The measures of CT and scan in one frame, and of the fused mesh."""
 
     spheres_compared: Annotated[Count, "spheres found in both CT and scan"] = None
     spheres_moved: Annotated[Count, "spheres that moved by more than their uncertainty explains"] = None

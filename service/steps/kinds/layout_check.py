@@ -55,7 +55,7 @@ class Params(StepParams):
 
 
 class Measures(LayoutMeasures):
-    """Of the layout, and of the photographs that show it."""
+    """The measures of the layout, and of the photographs that show it."""
 
     spheres_seen: Annotated[Count, "spheres found in the photographs"] = None
     photographs_used: Annotated[Count, "photographs that the layout was judged from"] = None
@@ -181,7 +181,7 @@ def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> No
 
 
 def _move_hand(move: layout.SphereMove) -> dict[str, object]:
-    """Tell the simulated technician where in the photograph the sphere is, as the screen tells a person."""
+    """Return an action that shows the simulated technician where in the photograph the sphere is."""
     return {
         "action": "move_sphere",
         "from": list(move.old_place),

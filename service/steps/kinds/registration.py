@@ -55,7 +55,7 @@ class StructureFromMotion(Record):
 
 
 class Params(StepParams):
-    """Which images, which scan, which camera poses."""
+    """The images, the scan and the camera poses of the registrations."""
 
     gives: ClassVar = "registrations"
     repeated: ClassVar = RepeatedStep(
@@ -113,7 +113,7 @@ _CONSISTENCY = ("consistency_mm", "consistency_mrad")  # measures of the job tha
 
 
 class Measures(RegistrationMeasures[OneRegistration]):
-    """Of the outlines, and of every registration."""
+    """The measures of the outlines, and of every registration."""
 
     outlines: Annotated[Count, "outlines of spheres found in all images"] = None
     outlines_an_image: Annotated[Count, "outlines found in an image, on average"] = None
@@ -264,7 +264,7 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
 
 
 def _tell_findings(context: StepContext, outcome: StepOutcome) -> None:
-    """Tell what contradicts in the inputs, once for registrations that show the same."""
+    """Report what contradicts in the inputs, once for registrations that show the same."""
     assert isinstance(outcome.result, Result)
     shown: dict[str, list[str]] = {}
     for name, record in outcome.result.registrations.items():

@@ -30,7 +30,7 @@ _NAMES_APPLICATION = NamesStep("applies a coat", lambda params: isinstance(param
 
 
 class Params(StepParams):
-    """What the scan must contain."""
+    """The contents that the scan must have, and where it comes from."""
 
     gives: ClassVar = "scan_surface"
     repeated: ClassVar = RepeatedStep("Scan again, export the scan, and import it")
@@ -50,7 +50,7 @@ class Params(StepParams):
 
 
 class Measures(SphereMeasures):
-    """Of the mesh as it was exported, and of the spheres in it."""
+    """The measures of the mesh as it was exported, and of the spheres in it."""
 
     scan_vertices: Annotated[Count, "vertices of the scan"] = None
     scan_faces: Annotated[Count, "faces of the scan"] = None
@@ -144,7 +144,7 @@ class _LeftOut:
         self._imported = {(ref.original_name, ref.size_bytes) for ref in kept}
 
     def look(self, exports: Sequence[ScanExport]) -> None:
-        """Tell of exports of which it was not told yet; a host whose clock was set back dates new ones before.
+        """Report exports that were not reported yet; a host whose clock was set back dates new ones before.
 
         Those that an earlier step of this run imported are where they belong.
         """
@@ -172,7 +172,7 @@ class _LeftOut:
 
 
 def _age(context: StepContext, application: str) -> dict[str, float]:
-    """The time since a coat was applied, and nothing if it cannot be told, with the reason; both clocks are noted."""
+    """Return the time since a coat was applied; nothing, with the reason, if it is unknown. Both clocks are noted."""
     applied = earlier_result(context, application, timed_application.Result).applied
     arrived = context.moment()
     age = elapsed(applied, arrived)

@@ -16,7 +16,7 @@ from service.steps.measures import Count, MeasureRecord
 
 
 class Params(StepParams):
-    """What is applied and how long it lasts."""
+    """The product that is applied, and how long it lasts."""
 
     repeated: ClassVar = RepeatedStep(
         "Judge it again as it is; the time since the coating runs on", same=True, device=False, computes=False
@@ -48,7 +48,7 @@ class Result(Record):
 
     product: str
     applied_monotonic_s: float
-    applied_utc: str = ""  # ISO 8601; "" in a run of a version that kept the monotonic time alone
+    applied_utc: str = ""  # ISO 8601; "" in a run of a version that stored the monotonic time alone
     applied_boot: str = ""  # boot id of the host, in which the monotonic time counts
     scan_within_s: float
     sublimates_after_s: float

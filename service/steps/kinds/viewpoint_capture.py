@@ -21,7 +21,7 @@ from service.steps.views import CaptureTask, CaptureTotals, capture_viewpoints
 
 
 class Params(MovingParams):
-    """Which viewpoints, what the images are for, and what is computed from them during the capture."""
+    """The viewpoints, the purpose of the images, and the numbers computed from them during the capture."""
 
     repeated: ClassVar = RepeatedStep("Take the views that are missing or would help; the others are kept")
 
@@ -42,7 +42,7 @@ class Params(MovingParams):
 
 
 class Measures(PredictedMeasures, CaptureMeasures):
-    """Of the capture, and of what its images are predicted to give."""
+    """The measures of the capture, and what its images are predicted to give."""
 
     images_spoilt: Annotated[
         Count, "images that are black, blurred or overexposed, and were so again when they were repeated"
@@ -57,7 +57,7 @@ class Measures(PredictedMeasures, CaptureMeasures):
 
 
 class Result(Record):
-    """What was captured; the images themselves are in the viewpoint events."""
+    """The purpose and number of the images; the images themselves are in the viewpoint events."""
 
     purpose: str
     captured: int
