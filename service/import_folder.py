@@ -96,12 +96,12 @@ def find_places(
 
 @dataclass(frozen=True, slots=True)
 class CtReading:
-    """What a rig.yaml would say of the CT series.
+    """The settings that a rig.yaml would have for the CT series.
 
     Attributes:
-        first_number: of the first slice of a whole series.
+        first_number: the number of the first slice of a whole series.
         series: a part of the description of the series to use, where there are several.
-        unspecified_is_hounsfield: values of a series that states no unit are Hounsfield units.
+        unspecified_is_hounsfield: true if values of a series without a unit are Hounsfield units.
     """
 
     first_number: int = 1
@@ -355,7 +355,7 @@ def _companions(mesh: Path) -> Iterable[Path]:
     return export_of(mesh).files
 
 
-# --- words and records ------------------------------------------------------------------------------------------
+# --- texts and records ------------------------------------------------------------------------------------------
 
 
 def _file(file: ListedFile, places: ImportFolders, media_type: str = "application/octet-stream") -> ImportedFile:

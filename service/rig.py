@@ -160,12 +160,12 @@ class AlertsSection(Record):
 
     webhook: WebhookSection | None = None  # a web address to notify
     email: EmailSection | None = None  # people to write to
-    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # what is told
+    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # what is reported
     waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # how long a run waits for a person before an alert
 
 
 class SigningSection(Record):
-    """What may replace the password when a step is signed or figures are accepted; the password always works."""
+    """The replacements for the password when a step is signed or figures are accepted; the password always works."""
 
     pin: bool = False  # a PIN may
     badge: bool = False  # read by a reader that types the code and Enter
@@ -173,7 +173,7 @@ class SigningSection(Record):
 
 @dataclass(frozen=True, slots=True)
 class RigDevice:
-    """What the driver of a device in the rig file says of it."""
+    """The driver's statements about a device in the rig file."""
 
     kind: str  # robot, camera, scanner, ct or lightbox
     abandoned: Abandoned | None  # what becomes of its motion if the program that drives it dies
@@ -190,7 +190,7 @@ class RigSection(Record):
     stations: dict[str, StationSection] = Field(default_factory=dict)  # by the name that protocols use
     # The camera mount's drawing: a rigid 4×4 matrix, metres; the calibration replaces it.
     T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
-    payload: PayloadSection | None = None  # what the arm is told it carries
+    payload: PayloadSection | None = None  # what the arm is configured to carry
     collision: CollisionSection = CollisionSection()  # what the plan of motions keeps clear of
     optics: OpticsSection | None = None  # None: depth of field is not judged
     lens: LensSection | None = None  # required if the software plans the board poses

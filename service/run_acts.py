@@ -77,7 +77,7 @@ def cancel_computation(store: Store, run_id: str, job: str, reason: str, *, acto
 def see_robot(log: RunRecord, device: str, lost_seq: int, *, driven: bool, actor: str) -> None:
     """Record that a person has looked at an arm whose connection was lost. Nothing moves by it.
 
-    `lost_seq` is the event of the loss that the person was told of, 0 for an arm that was only left alone; `driven`
+    `lost_seq` is the event of the loss that was shown to the person, 0 for an arm that was only left alone; `driven`
     says whether a process drives the run. Raises IllegalTransitionError if it stands otherwise with the arm.
     """
     loss = lost_arms(log.state).get(device)
@@ -102,7 +102,7 @@ def drawing_step(log: RunRecord) -> str:
 
 
 def step_to_draw_for(log: RunRecord) -> str:
-    """As `drawing_step`. Raises IllegalTransitionError if there is none."""
+    """Return the `drawing_step`. Raises IllegalTransitionError if there is none."""
     step = drawing_step(log)
     if not step:
         raise IllegalTransitionError(

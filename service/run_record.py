@@ -105,7 +105,7 @@ class RunFollower:
         known = len(self._events)
         if self.store.head(self.run_id) != known:  # steps that wait look often, and seldom is anything new
             for event in self.store.events(self.run_id, after_seq=known):
-                # Fold first: an event that is refused must not be kept.
+                # Fold first: an event that is refused must not be stored.
                 self._state = advance(self.protocol, self._state, event)
                 self._events.append(event)
         if self._state.leave != leave:
@@ -140,7 +140,7 @@ class OpenJob:
 
     @property
     def text(self) -> str:
-        """On a line of its own."""
+        """The comment's text on a line of its own."""
         return f"{self.words} of step {self.step}, {self.standing}"
 
 
@@ -188,7 +188,7 @@ class StepEvidence:
         return self.log.store.artefact_path(ref.sha256)
 
     def holds(self, sha256: str) -> bool:
-        """Whether the run has recorded a file with this content."""
+        """Return whether the run has recorded a file with this content."""
         return self.log.store.holds(self.log.run_id, sha256)
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
@@ -249,11 +249,11 @@ class StepEvidence:
             self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """What people at screens have asked of this step, in order."""
+        """Return what people at screens have asked of this step, in order."""
         return self.log.refresh().steps[self.step].asked
 
     def computing(self) -> bool:
-        """Whether a worker computes a job of this run at this moment."""
+        """Return whether a worker computes a job of this run at this moment."""
         return bool(self.log.store.jobs_started(self.log.run_id))
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:

@@ -33,12 +33,12 @@ def require_runnable(loaded: LoadedProtocol, rig: Rig, devices: Mapping[str, Rig
     Args:
         loaded: the protocol.
         rig: the rig. One without any device captures nothing, so that its stations and devices are not asked for.
-        devices: what the drivers say of the rig's devices, by name.
+        devices: the drivers' statements about the rig's devices, by name.
 
     Raises:
         ProtocolError: params name the wrong steps, a gate a measure that its step does not have, or a step a station
             that the rig does not have; or an arm would move too fast.
-        ConfigurationError: the rig lacks a device of a step.
+        ConfigurationError: the rig does not have a device of a step.
     """
     captures = bool(rig.section.devices)
     require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None, devices)
@@ -61,9 +61,9 @@ def start_run(
         store: the data folder.
         loaded: the protocol.
         rig: the rig.
-        operator: the person who begins the run.
-        auto_confirm: whether confirmations are automatic, on a simulated rig.
-        about: what was entered about the run.
+        operator: the person who starts the run.
+        auto_confirm: true for automatic confirmations, on a simulated rig.
+        about: the facts entered about the run.
 
     Raises:
         ConfigurationError: automatic confirmation is requested on a rig that is not simulated.

@@ -66,7 +66,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 class Station:
-    """The devices of one rig, opened on first use and kept open until `close`."""
+    """The devices of one rig, opened on first use and left open until `close`."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -116,10 +116,10 @@ class Station:
             self._unlock(name)
 
     def heard(self, name: str) -> tuple[RecordedDevice, Secrets]:
-        """All that a device says of itself, opened for this alone, and texts that must not leave with it.
+        """Return all that a device says of itself, opened for this alone, and texts that must not leave with it.
 
-        One that cannot be opened is given with the error and with what can be heard nevertheless. No arm is told its
-        payload. Raises ConfigurationError if its section of the rig file is wrong.
+        One that cannot be opened is given with the error and with what can be heard nevertheless. No arm's payload is
+        set. Raises ConfigurationError if its section of the rig file is wrong.
         """
         spec, _ = self._spec(name)
         config = self._config(name, spec)
@@ -273,7 +273,7 @@ class Station:
         self._open[name] = device
 
     def hold_arms(self) -> None:
-        """Stop and close every open arm, which is told a leave once only; a dead link holds none of this up."""
+        """Stop and close every open arm, which gets a leave once only; a dead link delays none of this."""
         for name in self.opened("robot"):
             arm = cast(RobotArm, self._open.pop(name))
             with suppress(OrthocaptureError):
@@ -319,7 +319,7 @@ class Station:
         return self._spec(name)[0].kind
 
     def abandoned(self, name: str) -> Abandoned | None:
-        """What becomes of a motion of this device whose program died, by its section of the rig file."""
+        """Return what becomes of a motion of this device whose program died, by its section of the rig file."""
         return self._config(name, self._spec(name)[0]).abandoned
 
     def _of_kind(self, kind: str) -> list[str]:
@@ -379,7 +379,7 @@ class Station:
 
 
 def _secrets_of(config: DriverConfig) -> Secrets:
-    """What a device's section of the rig file tells of the site, and the names of files where it exports."""
+    """Return what a device's section of the rig file says of the site, and the names of files where it exports."""
     settings = {field: str(value) for field, value in config.model_dump().items() if isinstance(value, str | Path)}
     addresses = [value for field, value in settings.items() if field in _PLACE_FIELDS]
     folder = Path(settings["folder"]) if settings.get("folder") else None
@@ -392,7 +392,7 @@ def _secrets_of(config: DriverConfig) -> Secrets:
 
 
 def _words_of(error: DeviceError) -> str:
-    """What is wrong and what to do, without where: that names a place of this site."""
+    """Return what is wrong and what to do, without where: that names a place of this site."""
     return f"{error.what}. {error.remedy}" if error.remedy else error.what
 
 
@@ -437,6 +437,6 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
 
 
 def _is_arm(driver: object) -> bool:
-    """Whether a driver is of an arm, not of other axes; also of a missing one, which opening the device names."""
+    """Return whether a driver is of an arm, not of other axes; true for a missing one, which opening reports."""
     point = _installed().get(driver) if isinstance(driver, str) else None
     return point is None or cast(DriverSpec, point.load()).is_arm

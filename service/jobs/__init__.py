@@ -23,7 +23,7 @@ def job_kinds() -> Mapping[str, JobKind[Any, Any]]:
     return KindsOnDemand[JobKind[Any, Any]](__name__, GROUP, JobKind, lambda kind: (kind.order, kind.name))
 
 
-# Of names that are not job kinds; each job kind declares its own words.
+# Labels of names that are not job kinds; each job kind declares its own label.
 _WORDS: Mapping[str, str] = {"ct": "CT series", "control_image": "images of the control spheres"}
 
 

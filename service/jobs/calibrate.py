@@ -13,14 +13,14 @@ class Arguments(BoardSize):
     """Board images and what to solve from them.
 
     Attributes:
-        solve: which calibrations.
-        images: of the board.
+        solve: the calibrations to solve.
+        images: the images of the board.
         camera: known intrinsics; None if they are solved.
         corners: for each image, the file of its job `board_view`; None if the image has not been searched.
-        known: estimate of camera, mount and board, with which images of a part of the board can be used.
-        flatness_mm: largest bow of the board; None: nothing is stated.
+        known: an estimate of camera, mount and board, with which images of a part of the board can be used.
+        flatness_mm: the largest bow of the board; None: not given.
         seen: the board as the calibration of `camera` saw it; None if the camera is solved here.
-        size_tolerance: largest relative error of the board's size; None: nothing is stated.
+        size_tolerance: the largest relative error of the board's size; None: not given.
     """
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]

@@ -39,12 +39,12 @@ class ProjectionUncertainty(JobRecord):
     """Standard deviation of a projected point, in px, and in mm at the board's distance.
 
     Attributes:
-        distance_m: of the board.
-        centre_px, centre_mm: at the image's centre.
-        worst_px, worst_mm: the largest.
-        rms_px, rms_mm: over the image.
-        x_px, y_px: columns and rows of the grid.
-        sigma_px, sigma_mm: on the grid, row by row.
+        distance_m: the board's distance.
+        centre_px, centre_mm: the value at the image's centre.
+        worst_px, worst_mm: the largest value.
+        rms_px, rms_mm: the root mean square over the image.
+        x_px, y_px: the columns and rows of the grid.
+        sigma_px, sigma_mm: the values on the grid, row by row.
     """
 
     distance_m: float
@@ -72,8 +72,8 @@ class KnownBoard(JobRecord):
 
     Attributes:
         camera: nominal, or estimated from the images like the two poses.
-        T_flange_camera: of the camera on the flange.
-        T_base_board: of the board.
+        T_flange_camera: the camera's pose on the flange, (4, 4).
+        T_base_board: the board's pose in the base frame, (4, 4).
         spread: (12, 12); possible increments of the two poses.
         focal: relative tolerance of the focal length.
         centre: tolerance of the principal point, over the image's width.
@@ -126,12 +126,12 @@ class Tilt(JobRecord):
 
 
 class Intrinsics(JobRecord):
-    """What is known about the calibrated camera besides its parameters.
+    """The facts about the calibrated camera besides its parameters.
 
     Attributes:
-        model: of the distortion.
-        board: that was seen.
-        n_views: number of images used.
+        model: the distortion's model.
+        board: the board that was seen.
+        n_views: the number of images used.
         images: names of the images used.
         rms_px: residual of all corners.
         per_view_rms_px: residual of each image's corners, in the order of `images`.
@@ -140,8 +140,8 @@ class Intrinsics(JobRecord):
         sigma_independent: the same if the errors of corners were independent.
         sigma_by_image: the same from the scatter between images; None if there are too few.
         sigma_corner_px: standard deviation of a corner.
-        inflation: of the covariance, because errors within an image are alike.
-        covariance: of the free parameters.
+        inflation: the factor of the covariance, because errors within an image are alike.
+        covariance: the covariance of the free parameters.
     """
 
     model: str = ""
@@ -201,21 +201,21 @@ class Residuals(JobRecord):
 
 
 class RobotNoise(JobRecord):
-    """Repeatability of the arm's poses, 1σ; None where there were too few images to tell."""
+    """Repeatability of the arm's poses, 1σ; None where there were too few images to estimate it."""
 
     mm: float | None = None
     deg: float | None = None
 
 
 class BoardSizeByRobot(JobRecord):
-    """The board's true size over the stated one, as the robot's lengths show it.
+    """The board's true size over the given one, as the robot's lengths show it.
 
     Attributes:
-        ratio: by robot and images alone.
+        ratio: the ratio by robot and images alone.
         sigma: standard deviation of `ratio`.
-        tolerance: stated for the board, relative.
-        used: in the answer.
-        words: the same for people.
+        tolerance: the relative tolerance given for the board.
+        used: the ratio used in the answer.
+        words: a sentence on these for people.
     """
 
     ratio: float
@@ -241,7 +241,7 @@ class MethodSpread(JobRecord):
 
 
 class ArmRotations(JobRecord):
-    """Whether the arm's rotations determine the transform.
+    """The arm's rotations, which must differ enough to determine the transform.
 
     Attributes:
         rotation_spread_deg: largest rotation between two images.
@@ -269,23 +269,23 @@ class HandEye(JobRecord):
     """The hand-eye calibration.
 
     Attributes:
-        T_flange_camera: for the poses that the arm reports, without correction.
+        T_flange_camera: the transform for the poses that the arm reports, without correction.
         T_base_board: the board's pose.
-        sigma: of T_flange_camera.
-        residuals: by image.
-        robot_noise: of the arm's poses.
+        sigma: the standard deviations of T_flange_camera.
+        residuals: the residuals by image.
+        robot_noise: the noise of the arm's poses.
         setup: eye-in-hand for a camera on the flange, eye-to-hand for one beside the robot.
-        method: that gave T_flange_camera.
+        method: the method that gave T_flange_camera.
         methods: the transform by every method that gave an answer.
-        spread: between the methods.
+        spread: the differences between the methods.
         corner_sigma_px: standard deviation of a board corner.
-        motion: of the arm between the images.
+        motion: the arm's motion between the images.
         excluded: reason, by image that no fit used.
         turned: images in which the board was seen turned by 180°.
-        arm_held_out_rms_mm: error of held-out images, by terms of the arm's model; "none": poses as reported.
+        arm_held_out_rms_mm: the error of held-out images, by terms of the arm's model; "none": poses as reported.
         arm_correction: the answer with the arm's errors corrected; None if that does not improve held-out images.
-        board_size: by the robot.
-        findings: what robot and images contradict each other in, in words.
+        board_size: the board's size by the robot.
+        findings: sentences on what robot and images contradict each other in.
     """
 
     T_flange_camera: Matrix
@@ -308,5 +308,5 @@ class HandEye(JobRecord):
 
     @property
     def best(self) -> HandEye | ArmAnswer:
-        """What the registration uses: with the arm's correction, where there is one."""
+        """The answer that the registration uses: with the arm's correction, where there is one."""
         return self.arm_correction or self

@@ -15,11 +15,11 @@ class SceneArguments(ImagesCamera, Mounting):
     """Arguments that all jobs of a registration share.
 
     Attributes:
-        images: of the captures, including control captures.
+        images: the images of the captures, including control captures.
         intrinsics_covariance: (8, 8) of fx, fy, cx, cy, k1, k2, p1, p2, or a covariance with its parameters' names.
-        spheres_m: centres in the scan.
+        spheres_m: the spheres' centres in the scan.
         sphere_covariance_m2: (3, 3) of each centre.
-        radius_m: of the spheres.
+        radius_m: the spheres' radius.
     """
 
     images: tuple[PosedPhotograph, ...]

@@ -43,7 +43,7 @@ KIND = JobKind(
     answer=NoAnswer,
     compute="service.worker.front_end:features",
     words="features of the images",
-    version=3,  # of too many, those with small scales are kept
+    version=3,  # of too many, those with small scales remain
     order=40,
     aside=True,
     demand=lambda arguments: Demand(memory_mb=1100, limit_s=3600 + 300 * len(arguments.images)),

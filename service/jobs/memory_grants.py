@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class Grant(Record):
-    """What one process has been granted for its job, or waits for."""
+    """The memory that one process has been granted for its job, or waits for."""
 
     host: str
     boot: str
@@ -41,12 +41,12 @@ class Grant(Record):
     process_started_s: float
     job: str
     memory_mb: float
-    waits: str = ""  # why, in words; "" for one that has been granted
+    waits: str = ""  # the reason, as a phrase; "" for one that has been granted
     place: int = 0  # in the order in which those that wait came
 
     @property
     def lives(self) -> bool:
-        """Whether its process is not known to be dead."""
+        """True if its process is not known to be dead."""
         identity = ProcessIdentity(self.host, self.boot, self.pid, self.process_started_s)
         return identity.life() != "dead"
 
@@ -57,9 +57,9 @@ class MemoryGrants:
 
     Attributes:
         data: the data folder.
-        clock: of the worker.
-        memory: of the machine.
-        patience_s: for how long a job waits for other programs alone.
+        clock: the worker's clock.
+        memory: returns the machine's memory.
+        patience_s: the time for which a job waits for other programs alone.
     """
 
     data: Path
@@ -72,12 +72,12 @@ class MemoryGrants:
         """Wait until a job fits beside what runs; within the block its memory is granted.
 
         Args:
-            job: id.
-            memory_mb: that it needs at most, with what this process has already.
-            tell: called with why it waits, whenever that changes.
+            job: the job's id.
+            memory_mb: the most that it needs, with what this process has already.
+            tell: called with the reason of the wait, whenever that changes.
 
         Raises:
-            ComputeError: the machine does not have that much, or other programs have kept it for long.
+            ComputeError: the machine does not have that much, or other programs have occupied it for long.
         """
         whole = self.memory()
         if memory_mb > whole.total_mb - _RESERVE_MB:
@@ -191,7 +191,7 @@ def _used_mb(pid: int) -> float:
 
 
 def _rounded(memory_mb: float) -> int:
-    """To 50 MB, so that the words do not change all the time."""
+    """Round to 50 MB, so that the text does not change all the time."""
     return max(0, 50 * round(memory_mb / 50))
 
 

@@ -136,7 +136,7 @@ class Runner:
         self._leave.end(self._run.refresh(), why)
 
     def submit(self, action: OperatorAction, actor: str) -> None:
-        """Record an action if it is allowed now; otherwise record its refusal and tell the operator why."""
+        """Record an action if it is allowed now; otherwise record its refusal and show the operator the reason."""
         refusal = refuse(self.protocol, self._run.refresh(), action, actor)
         if refusal is None:
             self._leave.given_here()

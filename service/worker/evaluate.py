@@ -265,7 +265,7 @@ def _registered(
 
 
 class _Searched:
-    """What searches of the photographs found around control spheres, which registrations share."""
+    """The findings of searches around control spheres in the photographs, which registrations share."""
 
     def __init__(self, context: JobContext[job.Arguments]) -> None:
         self._context = context
@@ -303,7 +303,7 @@ class _Searched:
 
 
 def _covers(entry: tuple[Cone, float, tuple[SphereOutline, ...]], cone: Cone, window_rad: float) -> bool:
-    """Whether an earlier search looked wherever one around a cone would."""
+    """Return whether an earlier search looked wherever one around a cone would."""
     there, wide_rad, _ = entry
     return window_rad + float(np.linalg.norm(there.axis - cone.axis)) < 1.2 * wide_rad
 

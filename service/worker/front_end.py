@@ -64,14 +64,14 @@ def read_matches(
     prior: Mapping[str, Transform],
     options: SfmOptions,
 ) -> list[PairMatches]:
-    """The matches of those pairs of images that their prior poses select, whenever they were computed.
+    """Return the matches of those pairs of images that their prior poses select, whenever they were computed.
 
     Args:
-        context: of the job.
-        files: of matches.
-        names: of the images.
+        context: the job's context.
+        files: the hashes of the files of matches.
+        names: the images' names.
         prior: T_world_camera by image, which select the pairs; empty if unknown.
-        options: of structure from motion.
+        options: the options of structure from motion.
     """
     wanted = set(pairs_of(names, prior or None, options))
     found = (m for sha256 in files for m in unpack_matches(context.input(sha256).read_bytes()))
@@ -80,7 +80,7 @@ def read_matches(
 
 
 class _ColmapChildren(threading.local):
-    """COLMAP's child process of each thread, by seed; kept, because starting one takes as long as an image."""
+    """COLMAP's child process of each thread, by seed; it stays, because starting one takes as long as an image."""
 
     def __init__(self) -> None:
         self.children: dict[int, ColmapProcess] = {}

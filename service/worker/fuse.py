@@ -128,7 +128,7 @@ def _wound(fused: Fused, up: Array) -> tuple[Point, ...]:
 
 
 def _loop(arguments: job.Arguments, aligned: Aligned) -> TransformLoop | None:
-    """Around by the spheres and back by the cameras; None without images."""
+    """Close the loop: there by the spheres and back by the cameras; None without images."""
     of_ct, of_scan = arguments.ct_registration, arguments.scan_registration
     if of_ct is None or of_scan is None:
         return None

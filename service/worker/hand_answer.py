@@ -44,18 +44,18 @@ _H = TypeVar("_H", bound=HeldArguments)
 
 @dataclass(frozen=True, slots=True)
 class HandheldImage:
-    """An image that a person took, and what it contributes.
+    """An image that a person took, and its contribution.
 
     Attributes:
         viewpoint: its name.
-        used: whether it counts.
-        T_scene_camera: None where the image does not show where the camera was.
-        T_scene_level: frame with z up and y towards the top of the first image whose pose is known.
-        information: (6, 6) about the scan's pose.
-        seen: (P,) points of the surface that it shows.
-        cells: board corners in each cell of the frame; empty for images of the specimen.
-        reading: outlines and spheres, where the spheres have not been measured.
-        spheres_m: (S, 3) as the images up to this one show them.
+        used: true if it counts.
+        T_scene_camera: the camera's pose, (4, 4); None where the image does not show where the camera was.
+        T_scene_level: the frame with z up and y towards the top of the first image whose pose is known.
+        information: (6, 6) information about the scan's pose.
+        seen: (P,) mask of the points of the surface that it shows.
+        cells: the number of board corners in each cell of the frame; empty for images of the specimen.
+        reading: the outlines and spheres, where the spheres have not been measured.
+        spheres_m: (S, 3) centres as the images up to this one show them.
     """
 
     viewpoint: str
@@ -122,8 +122,8 @@ class HandGuide:
     """The state of a capture by hand after one more image.
 
     Attributes:
-        arguments: of the job.
-        scene: with the spheres as they are known now.
+        arguments: the job's arguments.
+        scene: the scene with the spheres as they are known now.
         new: the new image.
         earlier: all images before it, in order.
         good: the images that count and whose pose is known, the new one included.
@@ -136,7 +136,7 @@ class HandGuide:
     good: Sequence[HandheldImage]
 
     def places(self) -> list[WantedView]:
-        """The planned places."""
+        """Return the planned places."""
         return [_place(spot) for spot in self.arguments.places]
 
     def done(self) -> set[str]:
@@ -271,17 +271,17 @@ _SAME_M, _SAME_RAD = 0.02, np.deg2rad(3.0)  # an image nearer than this to anoth
 
 @dataclass(frozen=True, slots=True)
 class NewImage:
-    """What can be determined from the new image alone.
+    """The facts that can be determined from the new image alone.
 
     Attributes:
-        T_scene_camera: None if the pose cannot be determined.
-        why: why it cannot be used; "" if it can.
-        measures: numbers of this image.
-        information: (6, 6) about the scan's pose.
+        T_scene_camera: the camera's pose, (4, 4); None if it cannot be determined.
+        why: the reason why it cannot be used; "" if it can.
+        measures: the numbers of this image.
+        information: (6, 6) information about the scan's pose.
         up: (3,) direction away from the table, frame of the scene.
-        middle_m: (3,) of the scene.
-        cells: board corners in each cell of the frame.
-        reading: outlines and spheres, where the spheres have not been measured.
+        middle_m: (3,) middle of the scene.
+        cells: the number of board corners in each cell of the frame.
+        reading: the outlines and spheres, where the spheres have not been measured.
     """
 
     T_scene_camera: Transform | None

@@ -57,12 +57,12 @@ def _reduce(original: Path, copy: Path, full: CameraModel, width: int, height: i
 
 
 def robot_camera_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> Array:
-    """(N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
+    """Return (N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
 
     Args:
-        mounting: of the camera on the arm.
-        images: with `T_scene_camera` of a hand-held camera, or with `T_base_flange`; for a correction also with
-            `station` and `joints_rad`.
+        mounting: the camera's mounting on the arm.
+        images: the images, with `T_scene_camera` of a hand-held camera, or with `T_base_flange`; for a correction
+            also with `station` and `joints_rad`.
 
     Raises:
         DataError: the joints are not of the corrected arm.

@@ -49,7 +49,7 @@ class JobAnswer:
 
 @dataclass(frozen=True, slots=True)
 class JobContext(Generic[A]):
-    """What a job may use: its arguments, verified inputs, a scratch folder and the store for its outputs.
+    """A job's surroundings: its arguments, verified inputs, a scratch folder and the store for its outputs.
 
     `begin` surrounds the computation: a worker waits there until the machine has what the job demands.
     """
@@ -61,7 +61,7 @@ class JobContext(Generic[A]):
     begin: Callable[[Demand], AbstractContextManager[None]] = lambda _demand: nullcontext()
 
     def input(self, sha256: str) -> Path:
-        """An artefact's file, its hash verified."""
+        """Return an artefact's file after its hash was verified."""
         return self.store.artefact_path(sha256, verify=True)
 
     def input_json(self, sha256: str) -> Any:

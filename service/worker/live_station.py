@@ -81,10 +81,10 @@ class LiveStation:
 
     Attributes:
         solved: the registration.
-        informations: of each image, about the scan's pose.
+        informations: the information of each image about the scan's pose.
         P: (6, 6) covariance of one camera pose of the arm.
         mounting: (6, 6) covariance of the scan's pose due to the hand-eye transform.
-        centre_m: (3,) of the spheres, base frame.
+        centre_m: (3,) centre of the spheres, base frame.
         targets_m: (T, 3) points at which errors are predicted, relative to the centre, base axes.
     """
 

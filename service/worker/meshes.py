@@ -75,7 +75,7 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
 
 
 def _covered(T_ct_voxel: Array, slices: int) -> str:
-    """What slices cover along their normal, in words: half a series without a gap looks whole."""
+    """Say what slices cover along their normal: half a series without a gap looks whole."""
     normal = np.cross(T_ct_voxel[:3, 0], T_ct_voxel[:3, 1])
     normal /= np.linalg.norm(normal)
     first_m = float(normal @ T_ct_voxel[:3, 3])

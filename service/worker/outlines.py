@@ -33,11 +33,11 @@ from service.worker.records import camera_used
 
 
 def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
-    """Outlines of every sphere in every image, as one artefact that all registrations share.
+    """Detect the outlines of every sphere in every image, as one artefact that all registrations share.
 
     Poses predict where to search: the robot's, or those of a `model` from structure from motion, which has no scale.
-    Without poses, or if they are too inaccurate, the images are searched whole. Images that the model lacks get no
-    outlines.
+    Without poses, or if they are too inaccurate, the images are searched whole. Images that are not in the model get
+    no outlines.
     """
     arguments = context.arguments
     images, poses = _posed(context)

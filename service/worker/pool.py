@@ -94,7 +94,7 @@ class Pool:
 
     @property
     def busy(self) -> bool:
-        """Whether a living child has started a job and not reported its end."""
+        """True if a living child has started a job and not reported its end."""
         return any(child.busy and child.died_s is None for child in self._children)
 
     def pids(self) -> list[int]:

@@ -79,15 +79,15 @@ def intrinsics_record(
     names: Sequence[str],
     excluded: Mapping[str, str],
 ) -> calibration_records.Intrinsics:
-    """Everything but the camera itself; unknown numbers are None.
+    """Return everything but the camera itself; unknown numbers are None.
 
     Args:
         result: the calibration.
-        validation: None if there are too few images.
-        uncertainty: of a projected point.
-        warnings: about the images.
-        names: of the images used, in the order of `result.views`.
-        excluded: reason by image name, including images without the board.
+        validation: the cross-validation; None if there are too few images.
+        uncertainty: the uncertainty of a projected point.
+        warnings: sentences of warning about the images.
+        names: the names of the images used, in the order of `result.views`.
+        excluded: the reason by image name, including images without the board.
     """
     return calibration_records.Intrinsics(
         model=result.model,
@@ -307,7 +307,7 @@ def _number(value: float) -> float | None:
 
 
 def _rounded(values: Array) -> Matrix:
-    """To four digits."""
+    """Round to four significant digits."""
     return tuple(tuple(float(f"{value:.4g}") for value in row) for row in values)
 
 

@@ -112,13 +112,13 @@ class _ImagesToRegister:
     """The images that are registered.
 
     Attributes:
-        images: N photographs.
-        poses: (N, 4, 4) of the cameras, in the frame of each image's group.
-        groups: of each image; images of one group share a frame.
-        camera: at the size of the images.
-        outlines: of each image.
-        located: whether the poses come from the spheres that are registered.
-        left_out: those that contradict the others, and why; they have no pose.
+        images: the N photographs.
+        poses: (N, 4, 4) poses of the cameras, in the frame of each image's group.
+        groups: the group of each image; images of one group share a frame.
+        camera: the camera at the size of the images.
+        outlines: the outlines of each image.
+        located: true if the poses come from the spheres that are registered.
+        left_out: the images, by index, that contradict the others, and why; they have no pose.
     """
 
     images: Sequence[PosedPhotograph]
@@ -203,11 +203,11 @@ class _Placed:
 
     Attributes:
         T_world_scan: the registration.
-        T_world_station: by station.
-        T_scan_camera: by image.
-        components: (6, 6) each, of the covariance of T_world_scan.
-        given: (T_scan_camera by image, (6, 6) covariance) before the outlines refined the arm's corrected poses;
-            None for other poses.
+        T_world_station: the station's pose, by station.
+        T_scan_camera: the camera's pose, by image.
+        components: the parts, (6, 6) each, of the covariance of T_world_scan.
+        given: T_scan_camera by image and the covariance (6, 6) before the outlines refined the arm's corrected
+            poses; None for other poses.
     """
 
     T_world_scan: Transform
@@ -235,7 +235,7 @@ def _placed(
         images.known(answer.T_scan_camera),
         {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in stated.components.items()},
     )
-    if placing is not answer:  # the outlines of each image alone tell where its camera was
+    if placing is not answer:  # the outlines of each image alone show where its camera was
         return replace(
             placed,
             T_scan_camera=images.known(placing.T_scan_camera_refined),

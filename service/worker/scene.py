@@ -25,14 +25,14 @@ _A = TypeVar("_A", bound=LiveArguments | HeldArguments)
 
 @dataclass(frozen=True, slots=True)
 class CaptureScene:
-    """What the images of a capture are judged by.
+    """The camera, spheres and surface by which the images of a capture are judged.
 
     Attributes:
-        camera: calibrated or, for images of the board, nominal.
+        camera: the calibrated camera or, for images of the board, the nominal one.
         spheres_m: (S, 3) centres, frame of the scene.
-        radius_m: of the spheres.
-        limits: when a view counts for a point of the surface.
-        surface: of the specimen; None without a CT, and until it is computed.
+        radius_m: the spheres' radius.
+        limits: the conditions on which a view counts for a point of the surface.
+        surface: the specimen's surface; None without a CT, and until it is computed.
     """
 
     camera: CameraModel
