@@ -216,7 +216,7 @@ class Rig:
         return self.path.parent
 
     def nominal_T_flange_camera(self) -> Transform:
-        """T_flange_camera (4, 4) in metres from the mount's drawing.
+        """Return T_flange_camera (4, 4) in metres from the mount's drawing.
 
         Raises ConfigurationError if the rig file has none, or if it is not rigid.
         """
@@ -244,7 +244,7 @@ def load_rig(path: Path) -> Rig:
 
 
 def read_rig(path: Path) -> bytes:
-    """The bytes of a rig file. Raises ConfigurationError if it cannot be read."""
+    """Return the bytes of a rig file. Raises ConfigurationError if it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
@@ -263,7 +263,7 @@ def read_rig(path: Path) -> bytes:
 
 
 def parse_rig(source: bytes, path: Path) -> Rig:
-    """The rig in a file's bytes. Raises ConfigurationError that lists every problem with line and field."""
+    """Return the rig in a file's bytes. Raises ConfigurationError that lists every problem with line and field."""
     tree = _tree(source, path)
     section, problems = checked(tree.data, RigSection, tree)
     problems += tree.problems
@@ -274,7 +274,7 @@ def parse_rig(source: bytes, path: Path) -> Rig:
 
 
 def parse_recorded_rig(source: bytes, path: Path) -> Rig:
-    """The rig of a recorded run, read with the type conversions that older versions allowed.
+    """Return the rig of a recorded run, read with the type conversions that older versions allowed.
 
     Raises ConfigurationError if the bytes are not a rig file.
     """
@@ -310,7 +310,7 @@ def _violations(data: Plain) -> Iterator[tuple[FieldPath, str]]:
 
 
 def _tree(source: bytes, path: Path) -> YamlTree:
-    """The file as plain data. Raises ConfigurationError if it is neither YAML nor JSON, or not a mapping."""
+    """Return the file as plain data. Raises ConfigurationError if it is neither YAML nor JSON, or not a mapping."""
     # An import's list is JSON of thousands of lines, which would take seconds to parse as YAML.
     try:
         tree = _read_json(source, path) if source.startswith(b"{") else _read_yaml(source, path)

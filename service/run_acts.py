@@ -92,7 +92,7 @@ def see_robot(log: RunRecord, device: str, lost_seq: int, *, driven: bool, actor
 
 
 def drawing_step(log: RunRecord) -> str:
-    """The step for whose next fusion a region can be drawn now; "" if there is none.
+    """Return the step for whose next fusion a region can be drawn now; "" if there is none.
 
     It needs the registered scene, in whose frame the region is, and a run that has not ended.
     """
@@ -114,14 +114,14 @@ def step_to_draw_for(log: RunRecord) -> str:
 
 
 def out_of_date(state: RunState) -> IllegalTransitionError:
-    """The refusal of an answer to something that the run no longer asks."""
+    """Return the refusal of an answer to something that the run no longer asks."""
     return IllegalTransitionError(
         "the page was out of date: the run has gone on since it was shown", where=state.current, remedy=DECIDE_AGAIN
     )
 
 
 def read_region(step: str, source: Literal["ct", "scan"], corners: str, along: str) -> RegionDrawn:
-    """A region from its texts: corners and direction as JSON, in the frame of the scan, metres.
+    """Return a region from its texts: corners and direction as JSON, in the frame of the scan, metres.
 
     Raises ConfigurationError if they are not a polygon on the scene.
     """

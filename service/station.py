@@ -79,11 +79,11 @@ class Station:
         self._told: dict[str, int] = {}  # arm → seq of the last leave to move that it was given
 
     def names(self) -> tuple[str, ...]:
-        """Names of the devices, in the order of the rig file."""
+        """Return the names of the devices, in the order of the rig file."""
         return tuple(self.rig.section.devices)
 
     def device(self, name: str) -> Device:
-        """The device of this name, opened if need be. Raises ConfigurationError or DeviceError."""
+        """Return the device of this name, opened if need be. Raises ConfigurationError or DeviceError."""
         if name not in self._open:
             device = self._build(name)
             try:
@@ -97,7 +97,7 @@ class Station:
         return self._open[name]
 
     def report(self, name: str) -> DeviceReport:
-        """The report of a device, also of an arm that stands stopped and takes no payload.
+        """Return the report of a device, also of an arm that stands stopped and takes no payload.
 
         Raises ConfigurationError or DeviceError.
         """
@@ -147,7 +147,7 @@ class Station:
         return said, _secrets_of(config)
 
     def opened(self, kind: str) -> dict[str, Device]:
-        """The open devices of a kind, by name."""
+        """Return the open devices of a kind, by name."""
         # Copied first, because the reporter's thread calls this while devices are being opened.
         return {name: device for name, device in tuple(self._open.items()) if self.kind_of(name) == kind}
 
@@ -180,7 +180,7 @@ class Station:
     # --- devices by role, for steps (service.steps.context.Devices) ---
 
     def robot(self, station: str) -> RobotArm:
-        """The arm at a station, with the newest leave to move. Raises ConfigurationError or DeviceError."""
+        """Return the arm at a station, with the newest leave to move. Raises ConfigurationError or DeviceError."""
         name, leave = self.layout(station).robot, self._leave
         arm = cast(RobotArm, self.device(name))
         if leave is not None and self._told.get(name) != leave.seq:
@@ -197,11 +197,11 @@ class Station:
         self._leave = leave
 
     def camera(self) -> Camera:
-        """The rig's first camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
+        """Return the rig's first camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(Camera, self.device(self._only("camera")))
 
     def camera_named(self, name: str) -> Camera:
-        """A further camera by its name, or the first one for "". Raises ConfigurationError, DeviceError."""
+        """Return a further camera by its name, or the first one for "". Raises ConfigurationError, DeviceError."""
         if not name:
             return self.camera()
         if name not in self.rig.section.cameras:
@@ -211,7 +211,10 @@ class Station:
         return self._further(name, self.rig.section.cameras[name]).camera
 
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
-        """The rig's further cameras. Raises ConfigurationError if one is not a calibrated camera; DeviceError."""
+        """Return the rig's further cameras.
+
+        Raises ConfigurationError if one is not a calibrated camera; DeviceError.
+        """
         return tuple(self._further(name, section) for name, section in self.rig.section.cameras.items())
 
     def _further(self, name: str, section: FurtherCameraSection) -> FurtherCamera:
@@ -227,28 +230,28 @@ class Station:
         return FurtherCamera(name, cast(Camera, self.device(name)), section, calibration)
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The scanner of this name, or the rig's only one. Raises ConfigurationError or DeviceError."""
+        """Return the scanner of this name, or the rig's only one. Raises ConfigurationError or DeviceError."""
         return cast(Scanner, self.device(name or self._only("scanner")))
 
     def ct(self) -> CtSource:
-        """The rig's only CT source. Raises ConfigurationError unless there is exactly one, DeviceError."""
+        """Return the rig's only CT source. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(CtSource, self.device(self._only("ct")))
 
     def lightbox(self) -> Lightbox | None:
-        """The rig's light box, or None. Raises DeviceError."""
+        """Return the rig's light box, or None. Raises DeviceError."""
         names = self._of_kind("lightbox")
         return cast(Lightbox, self.device(names[0])) if names else None
 
     def layout(self, station: str) -> StationLayout:
-        """The layout of a station in the rig file. Raises ConfigurationError if there is no such station."""
+        """Return the layout of a station in the rig file. Raises ConfigurationError if there is no such station."""
         return layout_of(self.rig, station)
 
     def nominal_T_flange_camera(self) -> Transform:
-        """T_flange_camera (4, 4) in metres from the mount's drawing. Raises ConfigurationError without one."""
+        """Return T_flange_camera (4, 4) in metres from the mount's drawing. Raises ConfigurationError without one."""
         return self.rig.nominal_T_flange_camera()
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
-        """The arm's surroundings and the lens's optics in the rig file."""
+        """Return the arm's surroundings and the lens's optics in the rig file."""
         return self.rig.section.collision, self.rig.section.optics
 
     def lens(self) -> LensSection | None:
@@ -256,7 +259,7 @@ class Station:
         return self.rig.section.lens
 
     def imported(self) -> ImportList | None:
-        """The file list of an import, or None for a run that captures."""
+        """Return the file list of an import, or None for a run that captures."""
         return self.rig.section.imported
 
     def reopen(self, device: Device) -> None:
@@ -282,7 +285,7 @@ class Station:
             self._unlock(name)
 
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
-        """The connections to arms that have ended since the last call, in order."""
+        """Return the connections to arms that have ended since the last call, in order."""
         ended: list[ConnectionEnd] = []
         while self._ended:
             ended.append(self._ended.popleft())
@@ -315,7 +318,7 @@ class Station:
     # --- building ---
 
     def kind_of(self, name: str) -> str:
-        """The kind of a device: robot, camera, scanner, ct or lightbox."""
+        """Return the kind of a device: robot, camera, scanner, ct or lightbox."""
         return self._spec(name)[0].kind
 
     def abandoned(self, name: str) -> Abandoned | None:
@@ -397,7 +400,7 @@ def _words_of(error: DeviceError) -> str:
 
 
 def _one_name(field: str, address: str) -> str:
-    """A device's address in one form, however it was written: the port behind a link, the IP address of a host."""
+    """Return a device's address in one format, however it was written: a link's port, a host's IP address."""
     if field == "port":
         return address if ":" in address else os.path.realpath(address)
     if field != "host":
@@ -418,7 +421,7 @@ def devices_of(rig: Rig) -> dict[str, RigDevice]:
 
 
 def layout_of(rig: Rig, station: str) -> StationLayout:
-    """The layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
+    """Return the layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
     section = rig.section.stations.get(station)
     if section is None:
         known = ", ".join(rig.section.stations) or "none"

@@ -66,7 +66,7 @@ def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[flo
 
 
 def _time(stated: str) -> tuple[datetime, float] | None:
-    """The time that a photograph states, and its resolution in seconds."""
+    """Return the time that a photograph states, and its resolution in seconds."""
     for form in _FORMS:
         try:
             found = datetime.strptime(stated, form)  # noqa: DTZ007 - compared only with one that has no zone either
@@ -158,7 +158,7 @@ class ClockReading:
 
 
 def clock_offset_words(offset_s: float | None, clock: Literal["utc", "uptime"]) -> str:
-    """The clock offset in words that a device reported when it was opened."""
+    """Return the clock offset in words that a device reported when it was opened."""
     if clock == "uptime":
         return "counts from when it was switched on: only its drift matters"
     if offset_s is None:
@@ -167,7 +167,7 @@ def clock_offset_words(offset_s: float | None, clock: Literal["utc", "uptime"]) 
 
 
 def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
-    """The newest reading of every clock in a run's record: the host's first, then devices in the order of opening."""
+    """Return the newest reading of every clock in a run: the host's first, then devices as they were opened."""
     host: list[ClockReading] = []
     opened: dict[str, Event] = {}
     # Only the first image since a device was last opened, and the newest: a run may have ten thousand.
@@ -204,7 +204,7 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
 
 
 def _against_the_first(device: str, captures: Sequence[ViewpointCaptured], at_utc: str) -> list[ClockReading]:
-    """How far a further camera's clock is ahead of the first camera's, by the newest photographs."""
+    """Return how far a further camera's clock is ahead of the first camera's, by the newest photographs."""
     found = clock_offset(captures, device)
     if found is None:
         return []
@@ -222,7 +222,7 @@ def _report(opened: Event) -> RecordedReport:
 def _readings(
     name: str, opened: Event, report: RecordedReport, captures: tuple[Event, Event] | None
 ) -> list[ClockReading]:
-    """The readings of one device from its last opening and the first and newest image since."""
+    """Return the readings of one device from its last opening and the first and newest image since."""
     if report.clock == "uptime":
         return [_drift(name, opened, captures)]
     offset_s, at_utc = report.clock_offset_s, opened.at_utc

@@ -52,7 +52,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
 
 
 def plug_ins(group: str) -> tuple[EntryPoint, ...]:
-    """The entry points of one of our groups, by name; the installed packages are searched once for all groups."""
+    """Return the entry points of one of our groups, by name; installed packages are searched once for all groups."""
     return _plug_ins(tuple(sys.path)).get(group, ())
 
 

@@ -116,7 +116,7 @@ def forecast(
 
 
 def views_left(protocol: Protocol, state: RunState | None) -> int:
-    """Number of photographs that the protocol plans and that are not taken yet."""
+    """Return the number of photographs that the protocol plans and that are not taken yet."""
     left = 0
     for step in protocol.steps:
         now = None if state is None else state.steps[step.id]
@@ -128,5 +128,5 @@ def views_left(protocol: Protocol, state: RunState | None) -> int:
 
 
 def size_words(size_bytes: float) -> str:
-    """A size in words, such as `850 MB` or `12.3 GB`."""
+    """Return a size in words, such as `850 MB` or `12.3 GB`."""
     return f"{gigabytes(size_bytes):.1f} GB" if size_bytes >= 1e9 else f"{megabytes(size_bytes):.0f} MB"

@@ -40,7 +40,7 @@ def what_of(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """A text that can be printed and recorded: with escapes for what a terminal would obey, and not too long."""
+    """Return a text to print and record: not too long, and with escapes for what a terminal would obey."""
     return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in shown_lines(text).split("\n")), _LONGEST)
 
 

@@ -75,7 +75,7 @@ def kind_of(data: bytes) -> str:
 
 
 def another_kind(kind: str, wanted: str, where: str) -> ForeignKindError:
-    """The error for a file of this kind, as `kind_of` names it, where only the wanted ones are read."""
+    """Return the error for a file of this kind, as `kind_of` names it, where only the wanted ones are read."""
     return ForeignKindError(
         f"this is {_article(kind)} {kind}{'' if kind in _NO_PICTURES else ' picture'}, not {wanted}",
         where=where,

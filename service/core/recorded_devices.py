@@ -59,7 +59,7 @@ class RecordedOptics:
 
 
 def recorded_identity(stated: object) -> RecordedIdentity:
-    """The identity in a recorded DeviceReport; all fields are "" if there is none."""
+    """Return the identity in a recorded DeviceReport; all fields are "" if there is none."""
     fields = _mapping(stated)
     return RecordedIdentity(
         kind=_text(fields.get("kind")),
@@ -73,7 +73,7 @@ def recorded_identity(stated: object) -> RecordedIdentity:
 
 
 def recorded_report(report: object) -> RecordedReport:
-    """The `report` of a device_opened event."""
+    """Return the `report` of a device_opened event."""
     fields = _mapping(report)
     identity = recorded_identity(fields.get("identity"))
     stated = fields.get("clock") or ("uptime" if identity.kind == "robot" else "utc")
@@ -83,7 +83,7 @@ def recorded_report(report: object) -> RecordedReport:
 
 
 def recorded_optics(camera: object) -> RecordedOptics:
-    """The `camera` of a view's event. Zero stands for a length or f-number that the camera does not know."""
+    """Return the `camera` of a view's event. Zero stands for a length or f-number that the camera does not know."""
     fields = _mapping(camera)
     return RecordedOptics(
         model=_text(fields.get("model")),
@@ -123,7 +123,7 @@ class CameraBodies:
     stated: tuple[str, ...]
 
     def shown(self, identity: RecordedIdentity) -> str:
-        """The serial number to show for a device: for a camera that of the body, as its photographs state it."""
+        """Return the serial number to show for a device: for a camera its body's, as its photographs state it."""
         return self._own(identity.serial) if identity.kind == "camera" else identity.serial
 
     def _own(self, wire: str) -> str:
@@ -153,7 +153,7 @@ class CameraBodies:
 
 
 def bodies(events: Sequence[Event]) -> CameraBodies:
-    """The serial numbers in a run's events."""
+    """Return the serial numbers in a run's events."""
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
     views = (event.payload for event in events if isinstance(event.payload, RecordedView))
     identities = ((payload.device, recorded_report(payload.report).identity) for payload in opened)
@@ -161,7 +161,7 @@ def bodies(events: Sequence[Event]) -> CameraBodies:
 
 
 def bodies_of(identities: Iterable[tuple[str, RecordedIdentity]], stated: Iterable[str]) -> CameraBodies:
-    """The serial numbers of cameras.
+    """Return the serial numbers of cameras.
 
     Args:
         identities: (name in rig.yaml, identity in its DeviceReport) of each opened device.
@@ -219,7 +219,7 @@ def exchanged(events: Iterable[Event], device: str, opened: RecordedIdentity) ->
 
 
 def exchanged_words(device: str, before: RecordedIdentity, now: RecordedIdentity) -> str:
-    """`camera is another camera: it has the serial number 5678, the one before had 1234`."""
+    """Return `camera is another camera: it has the serial number 5678, the one before had 1234`."""
     if now.serial and before.serial:
         what = f"it has the serial number {now.serial}, the one before had {before.serial}"
     else:

@@ -122,7 +122,7 @@ def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
 
 
 def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
-    """Every way on for a stopped run, the available ones first; empty while nothing stops it.
+    """Return every way on for a stopped run, the available ones first; empty while nothing stops it.
 
     Ending the run is always available. It is the last of the available ones, unless the protocol recommends it
     (`on_failure: abort`).
@@ -154,12 +154,12 @@ def _changed(state: RunState) -> bool:
 
 
 def planned_views(step: Step) -> int:
-    """Number of images that the protocol plans for a step."""
+    """Return the number of images that the protocol plans for a step."""
     return sum(int(one.count) for one in planned_sets(step))
 
 
 def planned_sets(step: Step) -> tuple[Any, ...]:
-    """A step's sets of viewpoints and the board poses that the software plans; each has `count` and `station`."""
+    """Return a step's sets of viewpoints and of planned board poses; each has `count` and `station`."""
     planned = getattr(step.params, "board_poses", None)
     listed: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
     return listed if planned is None else (*listed, planned)
@@ -173,7 +173,7 @@ def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
 
 
 def takes_words(minutes: float | None) -> str:
-    """A duration in words, such as `about 12 min`."""
+    """Return a duration in words, such as `about 12 min`."""
     if minutes is None:
         return "not known"
     if minutes == 0:

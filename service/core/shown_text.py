@@ -22,7 +22,7 @@ _CONTINUED = "\n    "
 
 
 def shown(text: str) -> str:
-    """One line for a terminal, with an escape for every character that a terminal would obey."""
+    """Return one line for a terminal, with an escape for every character that a terminal would obey."""
     if text.isascii() and text.isprintable():
         return text
     return _OBEYED.sub(_escaped, text)
@@ -39,7 +39,7 @@ def shown_continued(text: str) -> str:
 
 
 def shown_json(text: str) -> str:
-    """JSON with \\u escapes for those characters that JSON leaves as they are and a terminal would obey."""
+    """Return JSON with \\u escapes for those characters that JSON leaves as they are and a terminal would obey."""
     return text if text.isascii() and text.isprintable() else _BEYOND_JSON.sub(_json_escaped, text)
 
 

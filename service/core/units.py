@@ -22,7 +22,7 @@ MISTAKEN_LENGTHS: Mapping[str, float] = {
 
 
 def mistaken_length(factor: float, relative: float) -> str:
-    """The mistaken unit by which lengths have to be multiplied by `factor`, in words; "" if none is as near."""
+    """Return name the mistaken unit by which lengths have to be multiplied by `factor`; "" if none is as near."""
     return next((words for words, known in MISTAKEN_LENGTHS.items() if abs(factor / known - 1) < relative), "")
 
 

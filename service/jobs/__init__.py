@@ -14,7 +14,7 @@ GROUP = "orthocapture.jobs"  # entry points of plug-ins; each names a JobKind
 
 @cache
 def job_kinds() -> Mapping[str, JobKind[Any, Any]]:
-    """All job kinds by name, in the order in which a run uses them: those of this package, and those of plug-ins.
+    """Return all job kinds by name, as a run uses them one after the other: this package's and those of plug-ins.
 
     Raises:
         ConfigurationError: two declare the same name, or an entry point names something that is not a JobKind; also

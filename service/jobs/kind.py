@@ -47,7 +47,7 @@ class Demand:
 
 
 def usual_demand(_arguments: JobRecord) -> Demand:
-    """The demand of a kind that states none, such as one of a plug-in."""
+    """Return the demand of a kind that states none, such as one of a plug-in."""
     return Demand(memory_mb=1000, limit_s=7200)
 
 
@@ -99,11 +99,11 @@ class JobKind(Generic[A, R]):
         )
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:
-        """The arguments of a recorded job of any version. Raises IntegrityError."""
+        """Return the arguments of a recorded job of any version. Raises IntegrityError."""
         return _read(self.arguments, resolve(recorded, jobs), f"the arguments of a job {self.name}")
 
     def read_answer(self, recorded: Mapping[str, Any]) -> R:
-        """The answer of a recorded job of any version. Raises IntegrityError."""
+        """Return the answer of a recorded job of any version. Raises IntegrityError."""
         return _read(self.answer, recorded, f"the answer of a job {self.name}")
 
 

@@ -134,7 +134,7 @@ class MemoryGrants:
         return grant
 
     def _why_not(self, wanted: Grant, others: Sequence[Grant]) -> str:
-        """Why a job cannot begin beside the others, in words; "" if it can."""
+        """Return why a job cannot start beside the others; "" if it can."""
         used_mb = {grant.pid: _used_mb(grant.pid) for grant in (wanted, *others)}
         granted = [other for other in others if not other.waits]
         free_mb = self.memory().available_mb - _RESERVE_MB
@@ -151,12 +151,12 @@ class MemoryGrants:
 
 
 def waiting_for_memory(data: Path) -> dict[str, str]:
-    """Why each job on this machine that waits for memory does so, in words, by the job's id."""
+    """Return why each job on this machine that waits for memory does so, as text by the job's id."""
     return {grant.job: grant.waits for grant in _grants(data) if grant.waits}
 
 
 def _grants(data: Path) -> Iterator[Grant]:
-    """Those of living processes of this machine; the files of dead ones are removed."""
+    """Yield the grants of living processes of this machine; remove the files of dead ones."""
     for path in sorted(_folder(data).glob(f"{_here().host}-*.json")):
         try:
             grant = Grant.model_validate_json(path.read_bytes())

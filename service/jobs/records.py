@@ -16,7 +16,7 @@ Hash = str  # SHA-256 of an artefact
 
 
 def matrix(rows: Iterable[Iterable[float]]) -> Matrix:
-    """The rows of an array as a record holds them."""
+    """Return the rows of an array as a record holds them."""
     return tuple(tuple(float(value) for value in row) for row in rows)
 
 
@@ -279,5 +279,5 @@ class ParameterCovariance(JobRecord):
 
 
 def image_of(job: JobState) -> ImageFile:
-    """The photograph that such a job was given. Raises ValidationError for a job of another kind."""
+    """Return the photograph that such a job was given. Raises ValidationError for a job of another kind."""
     return ImageFile.model_validate(job.arguments["image"])

@@ -181,5 +181,5 @@ def _record(context: StepContext, ref: ArtefactRef, device: str, note: str) -> N
 
 
 def layout_uncertainties(layout: JudgedLayout | None) -> dict[str, Uncertainty]:
-    """The uncertainty of each measure of a layout; empty where it was not judged (None)."""
+    """Return the uncertainty of each measure of a layout; empty where it was not judged (None)."""
     return {} if layout is None else dict(layout.bounds)

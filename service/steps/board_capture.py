@@ -85,7 +85,7 @@ class BoardCapture:
             self._new = planned
 
     def poses(self) -> tuple[Viewpoint, ...]:
-        """All poses of the step so far."""
+        """Return all poses of the step so far."""
         return (*self.given, *self._recorded())
 
     def _recorded(self) -> tuple[Viewpoint, ...]:
@@ -122,7 +122,7 @@ class BoardCapture:
         return self._rest(looks)
 
     def _planned(self) -> int:
-        """Number of poses planned so far, without replacements."""
+        """Return the number of poses planned so far, without replacements."""
         return sum(len(plan.poses) for plan in self._plans if plan.why != "replacement")
 
     def _rest(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
@@ -211,7 +211,7 @@ class BoardCapture:
         self._plans.append(plan)
 
     def planner(self, known: BoardKnowledge, *, coverage: float) -> Planner:
-        """The planner for this station."""
+        """Return the planner for this station."""
         layout = self.context.devices.layout(self.wanted.station)
         return Planner(
             self.wanted,
@@ -232,7 +232,7 @@ class BoardCapture:
         return lambda T: best_posture(T, scene) is not None
 
     def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
-        """The images that show the board, and the planned poses without an image."""
+        """Return the images that show the board, and the planned poses without an image."""
         seen = [look for look in looks if look.seen and look.view is not None]
         poses = np.array([np.array(look.capture.T_base_flange) @ known.T_flange_camera for look in seen])
         pixels = tuple(look.view.corners for look in seen if look.view is not None)
@@ -246,7 +246,7 @@ class BoardCapture:
     # --- what is known ---
 
     def knowledge(self) -> BoardKnowledge:
-        """The estimate of camera, mount and board from all images so far, including those of earlier attempts."""
+        """Estimate camera, mount and board from all images so far, including those of earlier attempts."""
         return self._knowledge(self.looks())
 
     def _knowledge(self, looks: Sequence[SearchedBoardImage]) -> BoardKnowledge:
@@ -301,7 +301,7 @@ class BoardCapture:
         capture_viewpoints(self.context, task)
 
     def looks(self, *, wait: bool = True) -> list[SearchedBoardImage]:
-        """Every valid image with what was found in it; with `wait`, once all have been searched."""
+        """Return every valid image with what was found in it; with `wait`, once all have been searched."""
         if wait:
             self._looks.wait()
         return self._looks.of(self.context.step.id)
@@ -395,7 +395,7 @@ def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapp
 
 
 def _wanted(failed: Sequence[GateVerdict], measures: Mapping[str, float]) -> tuple[int, list[Enough]]:
-    """The most poses to add, and the rules that say when they are enough."""
+    """Return the most poses to add, and the rules that say when they are enough."""
     least, most, rules = 1, _MOST, list[Enough]()
     for verdict in failed:
         name, value = verdict.measure, verdict.value
@@ -410,7 +410,7 @@ def _wanted(failed: Sequence[GateVerdict], measures: Mapping[str, float]) -> tup
 
 
 def _rule(name: str, value: float | None, low: float | None, high: float | None) -> Enough:
-    """A rule: whether a predicted number reaches the gate.
+    """Return a rule that says if a predicted number reaches the gate.
 
     For uncertainties, the measured value is scaled by the predicted ratio of after to before.
     """

@@ -93,11 +93,11 @@ class Planner:
         return PlannedBoard(poses, predicted)
 
     def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> PlanPrediction:
-        """The prediction without further images."""
+        """Return the prediction without further images."""
         return self._problem(known).predict(taken)
 
     def with_planned(self, taken: ChosenViews, T_base_camera: Array, known: BoardKnowledge) -> ChosenViews:
-        """The images with those added that are planned but not taken yet."""
+        """Return the images with those added that are planned but not taken yet."""
         future = self._problem(known).as_taken(T_base_camera)
         return taken.plus(future.T_base_camera, future.pixels)
 
@@ -105,12 +105,12 @@ class Planner:
         return DesignProblem(known, self.board, self.aims)
 
     def sent(self, T_base_camera: Transform, known: BoardKnowledge) -> Transform:
-        """T_base_camera for the nominal mount, if the camera is to be at T_base_camera with the estimated mount."""
+        """Return T_base_camera for the nominal mount that puts the camera at this one with the estimated mount."""
         return T_base_camera @ inverse(known.T_flange_camera) @ self.nominal_mount
 
 
 def preview_board(planner: Planner, known: BoardKnowledge) -> PlannedBoard:
-    """All poses as they would be planned if camera, mount and board were as stated, before anything has moved.
+    """Return all poses as they would be planned if camera, mount and board were as stated, before anything has moved.
 
     After the first pose, the place of the board counts as measured.
     """
@@ -157,7 +157,7 @@ def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None
 
 
 def prediction_record(prediction: PlanPrediction) -> BoardPrediction:
-    """The prediction as it is recorded: rounded, and without NaN."""
+    """Return the prediction as it is recorded: rounded, and without NaN."""
 
     def number(value: float, digits: int = 4) -> float | None:
         return round(value, digits) if np.isfinite(value) else None
@@ -174,7 +174,7 @@ def prediction_record(prediction: PlanPrediction) -> BoardPrediction:
 
 
 def describe_prediction(predicted: BoardPrediction, solve: Sequence[str]) -> str:
-    """`coverage 99 %, uncertainty of a projected point 0.006 mm, tilts to 40°`: what a plan is predicted to give."""
+    """Describe what a plan will give: `coverage 99 %, uncertainty of a projected point 0.006 mm, tilts to 40°`."""
     parts = [f"coverage {100 * predicted.coverage:.0f} %"]
     if "intrinsics" in solve and predicted.uncertainty_mm is not None:
         parts.append(f"uncertainty of a projected point {predicted.uncertainty_mm:.3f} mm")

@@ -77,7 +77,7 @@ class Coat:
 
 
 def coats(protocol: Protocol, state: RunState, now: Moment) -> tuple[Coat, ...]:
-    """The coats that are on the specimen while the scan that needs them has not passed."""
+    """Return the coats that are on the specimen while the scan that needs them has not passed."""
     if state.terminal:
         return ()
     found: list[Coat] = []
@@ -104,7 +104,7 @@ def coats(protocol: Protocol, state: RunState, now: Moment) -> tuple[Coat, ...]:
 
 
 def _scan_of(protocol: Protocol, application: Step) -> Step | None:
-    """The step that imports the scan of a coat: the one that names it, else the next one."""
+    """Return the step that imports the scan of a coat: the one that names it, else the next one."""
     later = protocol.steps[protocol.index(application.id) + 1 :]
     scans = [(step, step.params) for step in later if isinstance(step.params, scan_import.Params)]
     named = [step for step, params in scans if params.application == application.id]
@@ -112,7 +112,7 @@ def _scan_of(protocol: Protocol, application: Step) -> Step | None:
 
 
 def _limit_s(scan: Step) -> float | None:
-    """The largest age that the step's gate allows; None without such a gate."""
+    """Return the largest age that the step's gate allows; None without such a gate."""
     if not isinstance(scan.params, scan_import.Params) or scan.params.application is None:
         return None
     limits = [gate.max for gate in scan.gates if gate.measure == scan_import.AGE and gate.max is not None]
@@ -120,7 +120,7 @@ def _limit_s(scan: Step) -> float | None:
 
 
 def _left(seconds: float) -> str:
-    """`33 min`, and `4 min 10 s` when it is little; never more than is left."""
+    """Return `33 min`, and `4 min 10 s` when it is little; never more than is left."""
     if seconds >= _CLOSE_S:
         return f"{math.floor(seconds / _SHOWN_S)} min"
     shown_s = int(math.floor(seconds / _SHOWN_CLOSE_S) * _SHOWN_CLOSE_S)

@@ -92,30 +92,30 @@ class Devices(Protocol):
     """The open devices of a rig, by role; opened on first use. Raises ConfigurationError if the rig has none."""
 
     def robot(self, station: str) -> RobotArm:
-        """The arm at a station, configured with its payload, and free to move if a person has confirmed it.
+        """Return the arm at a station, configured with its payload, and free to move if a person has confirmed it.
 
         Raises SafetyStopError or LeaveNeededError if it was stopped after that confirmation.
         """
         ...
 
     def camera(self) -> Camera:
-        """The first camera: the one on the arm, or the only one."""
+        """Return the first camera: the one on the arm, or the only one."""
         ...
 
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
-        """The further cameras of the rig, in the order of the rig file; mostly none."""
+        """Return the further cameras of the rig, in the order of the rig file; mostly none."""
         ...
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The scanner of this name; without a name, the only one."""
+        """Return the scanner of this name; without a name, the only one."""
         ...
 
     def ct(self) -> CtSource:
-        """The folder in which the CT suite puts its files."""
+        """Return the folder in which the CT suite puts its files."""
         ...
 
     def lightbox(self) -> Lightbox | None:
-        """The light and environment box, if the rig has one."""
+        """Return the light and environment box, if the rig has one."""
         ...
 
     def layout(self, station: str) -> StationLayout:
@@ -123,19 +123,19 @@ class Devices(Protocol):
         ...
 
     def nominal_T_flange_camera(self) -> Transform:
-        """(4, 4) The camera on the flange according to the drawing of the mount, metres."""
+        """Return the camera's pose on the flange (4, 4) according to the drawing of the mount, metres."""
         ...
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
-        """Obstacles that the arm must avoid, and the lens if the rig file describes it."""
+        """Return the obstacles that the arm must avoid, and the lens if the rig file describes it."""
         ...
 
     def lens(self) -> LensSection | None:
-        """Focal length and sensor as the rig file states them, if it does."""
+        """Return focal length and sensor as the rig file gives them, if it does."""
         ...
 
     def imported(self) -> ImportList | None:
-        """The files to import, in a run that imports what was captured earlier; None in a run that captures."""
+        """Return the files to import, in a run that imports an earlier capture; None in a run that captures."""
         ...
 
     def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
@@ -155,7 +155,7 @@ class Devices(Protocol):
         ...
 
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
-        """The connections to arms that have ended since the last call, in order."""
+        """Return the connections to arms that have ended since the last call, in order."""
         ...
 
 
@@ -208,7 +208,7 @@ class JobResult:
 
     @classmethod
     def of(cls, job: JobState) -> Self:
-        """The answer of a finished job."""
+        """Return the answer of a finished job."""
         return cls(job.job, job.measures, job.artefacts, job.result)
 
     @property
@@ -233,7 +233,7 @@ class Evidence(Protocol):
         ...
 
     def path(self, ref: ArtefactRef) -> Path:
-        """The file that holds an artefact."""
+        """Return the file that holds an artefact."""
         ...
 
     def holds(self, sha256: str) -> bool:
@@ -241,7 +241,7 @@ class Evidence(Protocol):
         ...
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
-        """The valid captures of a step's current attempt, up to this moment, in order."""
+        """Return the valid captures of a step's current attempt, up to this moment, in order."""
         ...
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
@@ -261,11 +261,11 @@ class Evidence(Protocol):
         ...
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
-        """The jobs of a step in their present state, in the order in which they were enqueued."""
+        """Return the jobs of a step in their present state, in the order in which they were enqueued."""
         ...
 
     def state(self) -> RunState:
-        """The present state of the run."""
+        """Return the present state of the run."""
         ...
 
     def require_space(self) -> None:
@@ -333,7 +333,7 @@ class BeforeStep:
         return f" at {self.stations}" if self.stations else ""
 
     def images(self, of: str = "") -> str:
-        """`1 image`, `8 images of the board`."""
+        """Return `1 image`, `8 images of the board`."""
         return f"{self.views_left} {'image' if self.views_left == 1 else 'images'}{of}"
 
 

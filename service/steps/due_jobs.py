@@ -52,7 +52,7 @@ def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None
 
 
 def due(protocol: Protocol, state: RunState) -> list[NewJob]:
-    """All jobs that can be enqueued now because the results they need exist; none in an aborted run."""
+    """Return all jobs that can be enqueued now because the results they need exist; none in an aborted run."""
     if state.status == "aborted":
         return []
     jobs = early_matches(protocol, state)
@@ -68,7 +68,7 @@ def due(protocol: Protocol, state: RunState) -> list[NewJob]:
 
 
 def new_job(state: RunState, step: str, task: Task) -> NewJob:
-    """The job to enqueue for a task."""
+    """Return the job to enqueue for a task."""
     key = job_key(state, step, task.request.kind, task.name)
     request = task.request
     return NewJob(
@@ -130,7 +130,7 @@ class PendingResult:
 
 
 def duration_words(seconds: float) -> str:
-    """A duration rounded to the precision of an estimate: `20 s`, `4 min`."""
+    """Return a duration rounded to the precision of an estimate: `20 s`, `4 min`."""
     if seconds < 90:
         return f"{max(10, 10 * round(seconds / 10))} s"
     return f"{round(seconds / 60)} min"
@@ -166,11 +166,11 @@ class _Work(JobRecord):
     pairs: tuple[tuple[str, str], ...] = ()
 
     def count(self, kind: str) -> int:
-        """Number of images, or of pairs."""
+        """Return the number of images, or of pairs."""
         return len(self.pairs if kind == match.KIND.name else self.images)
 
     def size(self, kind: str) -> float:
-        """The number, weighted by their pixels for jobs whose duration depends on them."""
+        """Return the number, weighted by their pixels for jobs whose duration depends on them."""
         return self.count(kind)
 
 
@@ -181,7 +181,7 @@ class _Search(_Work):
     reduced_to: tuple[int, int] | None = None
 
     def size(self, kind: str) -> float:
-        """The number, weighted by their pixels."""
+        """Return the number, weighted by their pixels."""
         if self.camera is None:
             return self.count(kind)
         width, height = self.reduced_to or (self.camera.width, self.camera.height)
@@ -237,7 +237,7 @@ def _left_of(
     found: RegistrationJobs,
     clock: _JobTimes,
 ) -> list[PendingResult]:
-    """The missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
+    """Return the missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
     wanted = WantedRegistrations.of(step.params)
     evaluations = {} if evaluation is None else evaluation_tasks(state, evaluation, found)
     free_s = [0.0] * clock.cores
@@ -283,6 +283,6 @@ _CHAINS = {
 
 
 def _rest(source: str, last: str) -> tuple[str, ...]:
-    """The kinds of jobs that follow the last one that is planned."""
+    """Return the kinds of jobs that follow the last one that is planned."""
     chain = (detect_spheres.KIND.name, *_CHAINS.get(source, ()), register.KIND.name)
     return chain[chain.index(last) + 1 :] if last in chain else ()

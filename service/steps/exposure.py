@@ -45,7 +45,7 @@ class FurtherImage:
 
 
 def settings_of(camera: FurtherCamera, wanted: CameraSettings) -> CameraSettings:
-    """The settings of a further camera: those of the protocol, except what its section in rig.yaml states."""
+    """Return the settings of a further camera: those of the protocol, except what its section in rig.yaml states."""
     section = camera.section
     return replace(
         wanted,
@@ -57,7 +57,7 @@ def settings_of(camera: FurtherCamera, wanted: CameraSettings) -> CameraSettings
 
 
 def exposing_at(context: StepContext, viewpoint: Viewpoint, cameras: Sequence[FurtherCamera]) -> list[FurtherCamera]:
-    """The cameras that expose at a viewpoint: all but those that expose once at a station and have done so."""
+    """Return the cameras that expose at a viewpoint: all but those that expose once at a station and have done so."""
     seen = {
         exposure.device
         for capture in context.evidence.captures(context.step.id)
@@ -72,7 +72,7 @@ def exposing_at(context: StepContext, viewpoint: Viewpoint, cameras: Sequence[Fu
 def expose_further(
     cameras: Sequence[FurtherCamera], wanted: CameraSettings, folder: Path, expose: Expose
 ) -> tuple[FurtherImage, ...]:
-    """One image of each camera, one after the other. Raises DeviceError of the first that fails."""
+    """Take one image with each camera, one after the other. Raises DeviceError of the first that fails."""
     images: list[FurtherImage] = []
     for camera in cameras:
         inside = folder / camera.name  # of its own, because cameras may give files the same names
@@ -95,7 +95,7 @@ def keep_further(context: StepContext, further: FurtherImage) -> tuple[tuple[Art
 
 
 def files_of(context: StepContext, exposure: FurtherExposure) -> tuple[ArtefactRef, ...]:
-    """The files of an exposure to be recorded with it; the calibration only the first time."""
+    """Return the files of an exposure to be recorded with it; the calibration only the first time."""
     new = not context.evidence.holds(exposure.calibration.sha256)
     return (*exposure.artefacts, *((exposure.calibration,) if new else ()))
 
@@ -196,7 +196,7 @@ def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) 
 
 
 def _during(robot: RobotArm, image: CapturedImage, wanted: CameraSettings) -> tuple[RobotSample, ...]:
-    """The pose stream during an exposure."""
+    """Return the pose stream during an exposure."""
     began_s = image.trigger_monotonic_s
     return robot.samples(began_s, began_s + wanted.exposure_s + 0.3)
 
@@ -272,7 +272,7 @@ def _captured(context: StepContext, shot: Shot, refs: Sequence[ArtefactRef]) -> 
 
 
 def _tool(sample: RobotSample) -> _Tool:
-    """The tool that the controller held, as the event has it; it is the same in every sample of an exposure."""
+    """Return the tool that the controller held, as the event has it; all samples of an exposure have the same."""
     tool, payload = sample.T_flange_tcp, sample.payload
     return {
         "T_flange_tcp": None if tool is None else _rows(tool),
@@ -311,7 +311,7 @@ class ExposurePose:
 
 
 def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
-    """The pose of the flange during an exposure, from its samples, oldest first.
+    """Return the pose of the flange during an exposure, from its samples, oldest first.
 
     Raises DeviceUnavailableError if there are none.
     """
@@ -340,7 +340,7 @@ def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
 
 
 def wanted_settings(context: StepContext) -> CameraSettings:
-    """The camera settings of the protocol. Raises ConfigurationError if it has none."""
+    """Return the camera settings of the protocol. Raises ConfigurationError if it has none."""
     camera = context.protocol.camera
     if camera is None:
         raise ConfigurationError(
@@ -394,7 +394,7 @@ def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[Robot
 
 
 def camera_record(image: CapturedImage) -> dict[str, object]:
-    """The camera's part of the event of an exposure."""
+    """Return the camera's part of the event of an exposure."""
     return {
         **dataclasses.asdict(image.exif),
         "counter": image.counter,

@@ -27,7 +27,7 @@ class ExposureFiles:
 
 
 def developed(context: StepContext, exposures: Sequence[ExposureFiles]) -> dict[str, str]:
-    """The developed raw file of each exposure of one camera, by viewpoint."""
+    """Return the developed raw file of each exposure of one camera, by viewpoint."""
     parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
     requests = [
         JobRequest.of(
@@ -72,7 +72,7 @@ def locate_further_cameras(
 
 
 def _exposures(context: StepContext, images_of: Iterable[str]) -> list[tuple[str, FurtherExposure]]:
-    """(viewpoint, exposure) of every usable view."""
+    """Return (viewpoint, exposure) of every usable view."""
     return [
         (capture.viewpoint, exposure)
         for step in images_of
@@ -90,7 +90,7 @@ def _request(
     *,
     on_raw: bool,
 ) -> JobRequest:
-    """The job for one camera; its newest calibration counts."""
+    """Return the job for one camera; its newest calibration counts."""
     last = exposures[-1][1]
     recorded = outlines.arguments
     arguments: dict[str, object] = {

@@ -42,7 +42,7 @@ class Ring(Record):
     )
 
     def azimuths_deg(self) -> list[float]:
-        """The azimuths of its places."""
+        """Return the azimuths of its places."""
         span = self.azimuth_to_deg - self.azimuth_from_deg
         whole = span >= 360.0
         if self.count == 1:
@@ -122,7 +122,7 @@ def common_arguments(context: StepContext, params: Params) -> CommonArguments:
 
 
 def _places(params: Params) -> tuple[hand_view.PlannedPlace, ...]:
-    """The places of the hemisphere."""
+    """Return the places of the hemisphere."""
     return tuple(
         hand_view.PlannedPlace(
             name=f"{ring.tilt_deg:02.0f}/{k + 1}",
@@ -207,7 +207,7 @@ def _of_specimen(context: StepContext, params: Params) -> CommonArguments:
 
 
 def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], bool, Reference | None]:
-    """The spheres of the first step in `spheres_of` that has them, whether they are rough, and the reference to them.
+    """Return the first spheres of the steps `spheres_of`, whether they are rough, and the reference to them.
 
     Spheres that were located in photographs alone are rough.
     """
@@ -288,7 +288,7 @@ class Guide:
         self._reported = {job.job for job in self._jobs() if job.status != "enqueued"}
 
     def images_used(self) -> int:
-        """Number of usable images so far."""
+        """Return the number of usable images so far."""
         return int(self._measures().get("images_used", 0))
 
     def enough(self) -> bool:
@@ -304,7 +304,7 @@ class Guide:
         return evaluate_gates(self.context.step, self.context.attempt, measures, self.context.run.skipped).passed
 
     def outcome(self) -> StepOutcome:
-        """The outcome of the step."""
+        """Return the outcome of the step."""
         found = held_views(self.context, self.context.step.id)
         failed = {image_of(j).sha256: j.message for j in self._jobs() if j.status == "failed"}
         used: list[str] = []
@@ -424,5 +424,5 @@ class Guide:
 
 
 def _answer_of(job: JobState) -> hand_view.Answer:
-    """The answer of either kind of job: both answer alike."""
+    """Return the answer of either kind of job: both answer alike."""
     return hand_view.KIND.read_answer(job.result)

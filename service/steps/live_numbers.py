@@ -59,7 +59,7 @@ def look_at_further(
 
 
 def _exposures(context: StepContext) -> list[tuple[str, FurtherExposure]]:
-    """(viewpoint, exposure) of every usable view of the step."""
+    """Return (viewpoint, exposure) of every usable view of the step."""
     return [
         (capture.viewpoint, exposure)
         for capture in context.evidence.captures(context.step.id)
@@ -69,7 +69,7 @@ def _exposures(context: StepContext) -> list[tuple[str, FurtherExposure]]:
 
 
 def describe_further(job: JobState) -> str:
-    """One line on one image: `v1_005, side: 7/8 spheres, 0.18 px`, or what is wrong with it."""
+    """Return one line on one image: `v1_005, side: 7/8 spheres, 0.18 px`, or what is wrong with it."""
     viewpoint = image_of(job).viewpoint
     if job.status == "failed":
         return f"{viewpoint}, further camera: could not be analysed: {job.message}"
@@ -208,7 +208,7 @@ class LiveAnalysis:
         return dict(answer.measures)
 
     def spoilt_in_a_row(self) -> list[ImageSharpness]:
-        """The blurred or black images at the end of this step, if there are so many that the capture must stop."""
+        """Return the blurred or black images at this step's end, if there are so many that the capture must stop."""
         mine = self._looked_at(self.context.step.id)
         return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
 
@@ -224,7 +224,7 @@ class LiveAnalysis:
         return why_spoilt(self._looked_at(self.context.step.id), self._looked_at(*self.params.images_of))
 
     def unexamined(self) -> list[str]:
-        """The viewpoints whose image no finished job has looked at: nobody knows whether it is spoilt."""
+        """Return the viewpoints whose image no finished job has looked at: nobody knows whether it is spoilt."""
         captures = [c for c in self.context.evidence.captures(self.context.step.id) if all(c.verdicts.values())]
         seen = {image_of(job).sha256 for job in self._jobs("live_view") if job.status == "finished"}
         return [capture.viewpoint for capture in captures if capture.artefacts[0].sha256 not in seen]
@@ -237,7 +237,7 @@ class LiveAnalysis:
             self.context.note(SPOILT, viewpoints=names, attempt=self.context.attempt)
 
     def suggested(self) -> set[str]:
-        """Names of the viewpoints that earlier attempts of this step suggested."""
+        """Return the names of the viewpoints that earlier attempts of this step suggested."""
         return {view.viewpoint for note in suggested_views(self.context.state) for view in note.viewpoints}
 
     def _suggest(
@@ -278,7 +278,7 @@ class LiveAnalysis:
         return [job for step in steps for job in self.context.evidence.jobs(step) if job.kind == kind]
 
     def _earlier(self) -> tuple[tuple[Hash, ...], Each | None]:
-        """The files of the jobs on images that still count, in the order of capture, and the reference to them."""
+        """Return the files of the jobs on images that still count, in the order of capture, and their reference."""
         steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
         state = self.context.evidence.state()
         captures: list[RecordedView] = []
@@ -298,7 +298,7 @@ class LiveAnalysis:
         return files, each if resolve(each.record(), jobs) == list(files) else None
 
     def _looked_at(self, *steps: str) -> list[ImageSharpness]:
-        """The sharpness of the images of these steps whose job has finished, in the order of capture."""
+        """Return the sharpness of the images of these steps whose job has finished, in the order of capture."""
         by_image = {image_of(j).sha256: j for j in self._jobs("live_view") if j.status == "finished"}
         captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
         hashes = [capture.artefacts[0].sha256 for capture in captures]
@@ -340,7 +340,7 @@ class LiveAnalysis:
 
 
 def seen_words(seen: float, expected: float | None) -> str:
-    """`9/10 spheres`, or `13 spheres (10 expected in this image)` if there are more than expected."""
+    """Return `9/10 spheres`, or `13 spheres (10 expected in this image)` if there are more than expected."""
     if expected is None:
         return f"{seen:.0f} spheres"
     if seen > expected:
@@ -349,7 +349,7 @@ def seen_words(seen: float, expected: float | None) -> str:
 
 
 def describe_view(job: JobState) -> str:
-    """One line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
+    """Return one line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
     if job.status == "failed":
         return f"{image_of(job).viewpoint}: could not be analysed: {job.message}"
     m, answer = job.measures, live_view.KIND.read_answer(job.result)

@@ -30,7 +30,7 @@ class MotionLimits:
 
 
 def settle_criteria(context: StepContext) -> SettleCriteria:
-    """The protocol's definition of standing still."""
+    """Return the protocol's definition of standing still."""
     settle = context.protocol.settle
     return SettleCriteria(
         window_s=settle.window_s,

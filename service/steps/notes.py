@@ -116,15 +116,15 @@ def deidentified(state: StepState) -> tuple[Deidentified, ...]:
 
 
 def board_plans(state: StepState) -> tuple[BoardPlan, ...]:
-    """The board images planned in a step, oldest plan first."""
+    """Return the board images planned in a step, oldest plan first."""
     return tuple(BoardPlan.model_validate(note.data) for note in state.notes if note.note == BOARD_POSES)
 
 
 def suggested_views(state: StepState) -> tuple[SuggestedViews, ...]:
-    """The suggestions of a step, oldest first."""
+    """Return the suggestions of a step, oldest first."""
     return tuple(SuggestedViews.model_validate(note.data) for note in state.notes if note.note == SUGGESTION)
 
 
 def images_to_repeat(state: StepState, note: str) -> tuple[ImagesToRepeat, ...]:
-    """The notes SPOILT or DEPARTING of a step, oldest first."""
+    """Return the notes SPOILT or DEPARTING of a step, oldest first."""
     return tuple(ImagesToRepeat.model_validate(found.data) for found in state.notes if found.note == note)

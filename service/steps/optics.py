@@ -53,7 +53,7 @@ def optics_departures(
 
 
 def departing_images(departures: Sequence[OpticsDeparture]) -> int:
-    """The number of images that differ."""
+    """Return the number of images that differ."""
     return len({departure.image for departure in departures})
 
 

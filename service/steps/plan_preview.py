@@ -44,7 +44,7 @@ class BoardPreview:
 def preview_board_poses(
     protocol: Protocol, step: Step, rig: Rig, layout: Callable[[str], StationLayout]
 ) -> BoardPreview | None:
-    """None for steps whose board poses the software does not plan.
+    """Preview the board poses of a step; None if the software does not plan them.
 
     Raises ConfigurationError if protocol or rig file lack what a plan needs, or the scene is out of reach.
     """
@@ -67,7 +67,7 @@ def preview_board_poses(
 def preview_plans(
     protocol: Protocol, step: Step, rig: Rig, layout: Callable[[str], StationLayout]
 ) -> tuple[StepPlan, ...]:
-    """One plan for each station, from the arm's usual posture above the scene.
+    """Return one plan for each station, from the arm's usual posture above the scene.
 
     Empty for steps of other kinds, and if the rig file names no arm of known kinematics. Stations without an arm are
     left out.
@@ -91,7 +91,7 @@ def preview_plans(
 
 
 def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | None:
-    """The arm that the rig file names; None if it names none, or one of unknown kinematics, or no arm is there."""
+    """Return the arm that the rig file names; None if it names none or is not there, or for unknown kinematics."""
     collision = rig.section.collision
     model = known_arm(collision.arm) if collision.arm is not None and layout.is_arm else None
     if model is None:

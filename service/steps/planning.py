@@ -69,7 +69,7 @@ class ArmAtStation:
     motion: Motion
 
     def scene(self, start_rad: Array, *, sharp_at_m: Array | None = None) -> PlanningScene:
-        """The planner's problem for a motion that starts with the joints (N,) at `start_rad`.
+        """Return the planner's problem for a motion that starts with the joints (N,) at `start_rad`.
 
         `sharp_at_m`: (N, 3) points that must be sharp, base frame; None: the specimen.
         """
@@ -105,7 +105,7 @@ class ArmAtStation:
         )
 
     def _specimen(self) -> tuple[Transform, Array]:
-        """T_base_specimen, origin in the middle of its bounding box, and the box's half sizes (3,)."""
+        """Return T_base_specimen, origin in the middle of its bounding box, and the box's half sizes (3,)."""
         approach, up = np.array(self.layout.approach), np.array([0.0, 0.0, 1.0])
         axes = np.column_stack([approach, np.cross(up, approach), up])
         half = 0.5 * np.array(self.collision.specimen_size_m)
@@ -115,7 +115,7 @@ class ArmAtStation:
 
 
 def arm_at_station(context: StepContext, station: str, T_flange_camera: Transform) -> ArmAtStation | None:
-    """The arm at a station; None if its kinematics are not known, or if it is no arm."""
+    """Return the arm at a station; None if its kinematics are not known, or if it is no arm."""
     layout = context.devices.layout(station)
     if not layout.is_arm:
         return None
@@ -242,7 +242,7 @@ def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
 def feasible_extra(
     context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform
 ) -> list[tuple[Viewpoint, float]]:
-    """The further viewpoints of one station that the arm can reach, with the travel time (s) from where it stands.
+    """Return the further viewpoints of one station that the arm can reach, with the travel time (s) from its place.
 
     All of them, with a time of 0, for an arm of unknown kinematics.
     """

@@ -35,7 +35,7 @@ _ALIAS = {"deg": "°", "1": "", "degrees": "°"}
 
 
 def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, Measure] | None:
-    """The measures that a step with its parameters can yield; None if that cannot be determined."""
+    """Return the measures that a step with its parameters can yield; None if that cannot be determined."""
     kind = step_kinds().get(step.kind)
     if kind is None:
         return None
@@ -147,7 +147,7 @@ def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tupl
 
 
 def _named(step: Step, earlier: Sequence[Step], steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:
-    """Names in the params of a step that are not those of earlier steps, or of steps that do something else."""
+    """Yield names in the params of a step that are not those of earlier steps, or of steps that do something else."""
     before = [one.id for one in earlier]
     for at, name, mark in named_steps(step.params):
         where = ("params", *at)
@@ -179,7 +179,7 @@ def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, s
 def _too_fast(
     protocol: Protocol, rig: RigSection | None, devices: Mapping[str, RigDevice]
 ) -> Iterator[tuple[FieldPath, str]]:
-    """The protocol's motion, if it moves an arm faster than that may move, or than it can stop in time."""
+    """Yield the protocol's motion, if it moves an arm faster than that may move, or than it can stop in time."""
     if not any(step.moves_robot for step in protocol.steps):
         return
     named = None if rig is None else rig.collision.arm

@@ -93,7 +93,7 @@ class _Model:
     tracks: str | None = None
 
     def fields(self) -> dict[str, str]:
-        """The files as arguments of the jobs that use them."""
+        """Return the files as arguments of the jobs that use them."""
         return {"model": self.model} if self.tracks is None else {"model": self.model, "tracks": self.tracks}
 
 
@@ -117,7 +117,7 @@ class _Plan:
         self.jobs = jobs_of(self.state)
 
     def registration(self, name: str, source: str, size: str, priority: int) -> JobState | None:
-        """The finished job `register` of a registration, or None; the jobs that it needs become tasks."""
+        """Return the finished job `register` of a registration, or None; the jobs that it needs become tasks."""
         self._for, self._priority = name, priority
         if size and (reason := self._no_reduction(size)):
             self.failed[name] = reason
@@ -125,7 +125,7 @@ class _Plan:
         return self._registered(source, size)
 
     def _no_reduction(self, size: str) -> str:
-        """Why a size does not reduce the photographs, or "": a protocol serves cameras of any resolution."""
+        """Return why a size does not reduce the photographs, or "": a protocol serves cameras of any resolution."""
         width, height = _pixels(size)
         camera = read_part(ImagesCamera, self.outlines.arguments, self.jobs).camera
         # Otherwise one side at least would be cropped at full scale.
@@ -156,7 +156,7 @@ class _Plan:
         return None if model is None else self._need("register", source, size, {**markers, **model.fields()})
 
     def _mapper(self, source: str) -> str:
-        """The mapper of a source; a source without its own uses a mapper that another wanted source needs anyway."""
+        """Return the mapper of a source; one without uses that of another wanted source."""
         wanted = [mapper for other, mapper in _MAPPERS.items() if other in self.wanted.poses]
         return _MAPPERS.get(source) or next(iter(wanted), "incremental")
 
@@ -236,7 +236,7 @@ class _Plan:
         return arguments | {"reduced_to": [width, height]}
 
     def _need(self, kind: str, what: str, size: str, arguments: Mapping[str, Any]) -> JobState | None:
-        """The finished job for this work; None until it has finished, or if it has failed."""
+        """Return the finished job for this work; None until it has finished, or if it has failed."""
         name = "-".join(part for part in (what, size, self.root) if part)
         job = newest_job(self.state, self.step, kind, name)
         if job is not None and job.status == "failed":
@@ -253,7 +253,7 @@ class _Plan:
 
 
 def _uncorrected(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments that take the arms' poses as they are reported."""
+    """Return the arguments that take the arms' poses as they are reported."""
     without: dict[str, Any] = {"arm_correction": None}
     if arguments.get("further_arms"):
         without["further_arms"] = [{**arm, **without} for arm in arguments["further_arms"]]
@@ -272,7 +272,7 @@ def _pixels(size: str) -> tuple[int, int]:
 
 
 def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) -> RegistrationJobs | None:
-    """The jobs of a step's registrations according to the record; None for a step that has not begun them.
+    """Return the jobs of a step's registrations according to the record; None for a step that has not begun them.
 
     Also None in runs of old versions, in which a registration waited for all of its sources.
     """

@@ -52,7 +52,7 @@ class WantedRegistrations(BaseModel):
 
     @classmethod
     def of(cls, params: BaseModel) -> WantedRegistrations:
-        """Those of a registration step with these params."""
+        """Return those of a registration step with these params."""
         return cls.model_validate(params.model_dump(mode="json"))
 
     @property
@@ -68,7 +68,7 @@ class WantedRegistrations(BaseModel):
 
 
 def decisive(protocol: Protocol, step: Step) -> tuple[str, ...]:
-    """The registrations that a registration step waits for: those that gates name, and those that take seconds."""
+    """Return the registrations that a step waits for: those that gates name, and those that take seconds."""
     names = WantedRegistrations.of(step.params).registrations
     measures = [gate.measure for s in (step, *evaluations_of(protocol, step)) for gate in s.gates]
     waited = {name for measure in measures for name in _named(measure, names)} | {n for n in names if n in QUICK}
@@ -90,18 +90,18 @@ class _EvaluationParams(BaseModel):
 
 
 def evaluated_step(evaluation: Step) -> str:
-    """The registration step that an evaluation step evaluates."""
+    """Return the registration step that an evaluation step evaluates."""
     return _EvaluationParams.model_validate(evaluation.params.model_dump()).registration
 
 
 def evaluations_of(protocol: Protocol, registration: Step) -> tuple[Step, ...]:
-    """The evaluation steps of a registration step."""
+    """Return the evaluation steps of a registration step."""
     every = (step for step in protocol.steps if step.gives == "accuracy")
     return tuple(step for step in every if evaluated_step(step) == registration.id)
 
 
 def _named(measure: str, names: Iterable[str]) -> list[str]:
-    """The longest name that a measure begins with: `robot_corrected_rms_px` does not belong to `robot`."""
+    """Return the longest name that a measure begins with: `robot_corrected_rms_px` does not belong to `robot`."""
     found = sorted((name for name in names if measure.startswith(f"{name}_")), key=len)
     return found[-1:]
 
@@ -117,7 +117,7 @@ def of_arms(images: Iterable[PosedPhotograph]) -> bool:
 
 
 def needing_mount(poses: Iterable[str]) -> tuple[str, ...]:
-    """Those of the sources that need the camera's mount on its arm; "triangulated" may start from the spheres."""
+    """Return the sources that need the camera's mount on its arm; "triangulated" may start from the spheres."""
     names = tuple(poses)
     needing = ARM if "spheres" in names else (*ARM, "triangulated")
     return tuple(name for name in names if name in needing)

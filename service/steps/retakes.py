@@ -47,7 +47,7 @@ class ImageSharpness:
 
 
 def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness] = ()) -> dict[str, str]:
-    """The reason of each spoilt image by its SHA-256.
+    """Return the reason of each spoilt image by its SHA-256.
 
     Args:
         images: all images of one step.
@@ -66,7 +66,7 @@ def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness
 
 
 def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) -> list[ImageSharpness]:
-    """The spoilt images at the end of a sequence, in the order of capture; empty if there are fewer than IN_A_ROW."""
+    """Return the spoilt images at the end of a sequence, in the order of capture; none if fewer than IN_A_ROW."""
     row: list[ImageSharpness] = []
     for image in reversed(images):
         if image.sha256 not in reasons:
@@ -76,7 +76,7 @@ def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) 
 
 
 def spoilt_before(context: StepContext) -> set[str]:
-    """SHA-256 of images that were spoilt in an earlier attempt and have not been taken again yet."""
+    """Return the SHA-256 of images that were spoilt in an earlier attempt and have not been taken again yet."""
     captures = context.evidence.captures(context.step.id)
     return {
         capture.artefacts[0].sha256
@@ -135,7 +135,7 @@ TAKEN_AGAIN: Mapping[str, str] = {
 
 
 def to_take_again(context: StepContext) -> set[str]:
-    """SHA-256 of images that departed from the calibration's optics, or were spoilt, in an earlier attempt."""
+    """Return the SHA-256 of images that an earlier attempt spoilt, or took with other optics than the calibration."""
     captures = context.evidence.captures(context.step.id)
     notes = images_to_repeat(context.state, DEPARTING)
     attempts = [(note.attempt, set(note.viewpoints)) for note in notes if note.attempt is not None]
@@ -147,7 +147,7 @@ def to_take_again(context: StepContext) -> set[str]:
 
 
 def taken_for_good(captures: Iterable[RecordedView], again: Collection[str]) -> set[str]:
-    """The viewpoints that need no image any more: their newest is as required, and not one of `again` (SHA-256).
+    """Return the viewpoints that need no image any more: the newest is as required and not one of `again` (SHA-256).
 
     All others are reached by a motion, so they belong to the plan.
     """

@@ -83,7 +83,7 @@ _APART_M = 0.03  # views nearer than this to a planned one add little
 
 
 def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
-    """All viewpoints of a set in the base frame of its station, in the order of capture.
+    """Return all viewpoints of a set in the base frame of its station, in the order of capture.
 
     Raises NoViewpointError if the set is empty.
     """
@@ -134,7 +134,7 @@ def denser_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tup
 
 
 def flange_target(T_base_camera: Transform, T_flange_camera: Transform) -> Transform:
-    """T_base_flange that puts the camera at T_base_camera."""
+    """Return T_base_flange that puts the camera at T_base_camera."""
     return T_base_camera @ inverse(T_flange_camera)
 
 

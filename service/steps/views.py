@@ -67,7 +67,7 @@ class CaptureTotals:
     moved: int
 
     def measures(self) -> dict[str, float]:
-        """The totals under the names of measures."""
+        """Return the totals under the names of measures."""
         return {
             "viewpoints_planned": float(self.planned),
             "viewpoints_captured": float(self.captured),
@@ -198,7 +198,7 @@ class _CaptureLoop:
             self.task.on_captured()
 
     def _next(self) -> list[Viewpoint]:
-        """The viewpoints still to capture, in order.
+        """Return the viewpoints still to capture, in order.
 
         An image whose verdicts failed is taken again, once per execution.
         """
@@ -387,7 +387,7 @@ def _ends(viewpoint: Viewpoint, joints_rad: Array) -> bool:
 
 
 def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:
-    """One exposure without a robot, repeated with the camera reopened as often as the step's recovery allows.
+    """Take a photograph without a robot; repeat it with the camera reopened as often as the step's recovery allows.
 
     Raises DeviceError if it fails for good, StepInterruptedError on pause.
     """

@@ -23,7 +23,7 @@ from service.worker.records import camera_used
 
 
 def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
-    """SIFT features of some images, one artefact for each, in the order of the images."""
+    """Compute SIFT features of some images, one artefact for each, in the order of the images."""
     cv2.setNumThreads(1)  # jobs run in parallel
     images = context.arguments.images
     files = photographs(context, images)

@@ -90,7 +90,7 @@ def _settings(arguments: job.Arguments, aligned: Aligned) -> FusionSettings:
 
 
 def _frames(arguments: job.Arguments, aligned: Aligned) -> dict[str, Transform]:
-    """T_scan_frame by frame; without a registration there is no world."""
+    """Return T_scan_frame by frame; without a registration there is no world."""
     frames = {"scan": np.eye(4), "ct": aligned.T_scan_ct}
     if arguments.scan_registration is not None:
         frames["world"] = inverse(np.array(arguments.scan_registration.T_world_scan))

@@ -69,7 +69,7 @@ class HandheldImage:
     spheres_m: Array | None = field(repr=False)
 
     def plain(self, *, rough: bool) -> dict[str, object]:
-        """The view as it is written into its file; with `rough`, the spheres too."""
+        """Return the view as it is written into its file; with `rough`, the spheres too."""
         record: dict[str, object] = {
             "viewpoint": self.viewpoint,
             "used": self.used,
@@ -86,7 +86,7 @@ class HandheldImage:
 
 
 def read_views(context: JobContext[_H], scene: CaptureScene) -> list[HandheldImage]:
-    """The views of the earlier images, from their files."""
+    """Return the views of the earlier images, from their files."""
     return [_read(context, sha256, scene) for sha256 in context.arguments.earlier]
 
 
@@ -140,12 +140,12 @@ class HandGuide:
         return [_place(spot) for spot in self.arguments.places]
 
     def done(self) -> set[str]:
-        """Names of the planned places that have an image."""
+        """Return the names of the planned places that have an image."""
         level = self.new.T_scene_level
         return covered(self.places(), [] if level is None else self._poses(level), self.arguments.within_deg)
 
     def totals(self) -> dict[str, float]:
-        """The numbers of all images that count."""
+        """Return the numbers of all images that count."""
         places, measures = self.places(), {"images_used": float(len(self.good))}
         measures["hemisphere_coverage"] = len(self.done()) / len(places)
         if not isinstance(self.arguments, job.Arguments) or not len(self.scene.spheres_m):
@@ -187,7 +187,7 @@ class HandGuide:
         return [inverse(level) @ v.T_scene_camera for v in self.good if v.T_scene_camera is not None]
 
     def _information(self, arguments: job.Arguments) -> CurrentInformation:
-        """The images as measurements of the scan's pose, with the camera poses expected of structure from motion."""
+        """Return the images as measurements of the scan's pose, with poses as expected of structure from motion."""
         sigma_m, sigma_rad = arguments.pose_sigma_m, arguments.pose_sigma_rad
         seen = np.array([v.seen for v in self.good], dtype=np.int64).reshape(len(self.good), self.scene.n_points)
         return CurrentInformation(
@@ -200,7 +200,7 @@ class HandGuide:
         )
 
     def _shared(self, arguments: job.Arguments) -> Array:
-        """(6, 6) covariance that all images share, as the error budget counts it: edges, calibration and scan."""
+        """Return the (6, 6) covariance that all images share by the error budget: edges, calibration and scan."""
         scene, centre_m = self.scene, self.scene.spheres_m.mean(axis=0)
         placed = [(v.information, v.T_scene_camera) for v in self.good if v.T_scene_camera is not None]
         if not placed:
@@ -215,7 +215,7 @@ class HandGuide:
         return shared + lens_covariance_of_pose(placed, scene.camera, lens, centre_m)
 
     def _most_helpful(self, arguments: job.Arguments, T_scene_level: Transform) -> WantedView | None:
-        """The most helpful view of a denser hemisphere, once every planned place has its image."""
+        """Return the most helpful view of a denser hemisphere, once every planned place has its image."""
         scene, taken = self.scene, self._poses(T_scene_level)
         distance_m = float(np.median([spot.distance_m for spot in arguments.places]))
         typical = (_TYPICAL_PX / scene.camera.fx) ** 2 * np.eye(3)
@@ -324,7 +324,7 @@ def answer_to(
 
 
 def _level(found: NewImage, earlier: Sequence[HandheldImage]) -> Transform | None:
-    """T_scene_level of the first image that had one, else of this image if its pose is known."""
+    """Return T_scene_level of the first image that had one, else of this image if its pose is known."""
     level = next((view.T_scene_level for view in earlier if view.T_scene_level is not None), None)
     if level is None and found.T_scene_camera is not None:
         level = level_frame(found.middle_m, found.up, -found.T_scene_camera[:3, 1])
@@ -364,7 +364,7 @@ def _pose(place: WantedView) -> Matrix:
 
 
 def _repeats(T: Transform | None, used: Sequence[HandheldImage]) -> str:
-    """Why an image adds nothing to the earlier ones, or ""."""
+    """Return why an image adds nothing to the earlier ones, or ""."""
     if T is None:
         return ""
     same = [

@@ -42,7 +42,7 @@ class LiveRecord:
     seen: NDArray[np.bool_]
 
     def plain(self, sha256: str) -> dict[str, object]:
-        """The record as it is written, with the hash of the photograph."""
+        """Return the record as it is written, with the hash of the photograph."""
         return {
             "viewpoint": self.viewpoint,
             "station": self.station,
@@ -55,7 +55,7 @@ class LiveRecord:
 
 
 def read_records(context: JobContext[_L], hashes: Sequence[Hash], scene: CaptureScene) -> list[LiveRecord]:
-    """The records of earlier images, from their files."""
+    """Return the records of earlier images, from their files."""
     out: list[LiveRecord] = []
     for sha256 in hashes:
         data = context.input_json(sha256)
@@ -71,7 +71,7 @@ def read_records(context: JobContext[_L], hashes: Sequence[Hash], scene: Capture
 
 
 def last_known(records: Sequence[LiveRecord]) -> Transform | None:
-    """The newest T_base_scan of a station's images; None before one is determined."""
+    """Return the newest T_base_scan of a station's images; None before one is determined."""
     return next((r.T_base_scan for r in reversed(records) if r.T_base_scan is not None), None)
 
 

@@ -64,7 +64,7 @@ def _prediction(
 
 
 def _station_measures(station: LiveStation, view: LiveView, scene: CaptureScene) -> dict[str, float]:
-    """The numbers of the registration so far, and of the new image in it."""
+    """Return the numbers of the registration so far, and of the new image in it."""
     solved = station.solved
     T_camera_scan = inverse(view.T_base_camera) @ solved.T_base_scan
     residuals = solved.registration.residuals

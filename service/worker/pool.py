@@ -98,7 +98,7 @@ class Pool:
         return any(child.busy and child.died_s is None for child in self._children)
 
     def pids(self) -> list[int]:
-        """The children's process ids, in the order in which they were started."""
+        """Return the children's process ids, in the order in which they were started."""
         return [child.process.pid or 0 for child in self._children]
 
     def __enter__(self) -> Pool:

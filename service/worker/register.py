@@ -40,7 +40,7 @@ _LEAST_SPHERES = 4
 
 
 def register(context: JobContext[job.Arguments]) -> JobAnswer:
-    """T_world_scan for one source of poses. With robot poses, every station has its own base frame."""
+    """Compute T_world_scan for one source of poses. With robot poses, every station has its own base frame."""
     arguments, source = context.arguments, context.arguments.poses
     free = source == "spheres" and arguments.state_pose_errors
     refined = free or source == "robot_corrected"
@@ -134,11 +134,11 @@ class _ImagesToRegister:
         return [image.viewpoint for image in self.images]
 
     def posed(self, *, metric: bool) -> PosedImages:
-        """The images as a registration takes them."""
+        """Return the images as a registration takes them."""
         return PosedImages(self.poses, self.camera, groups=self.groups, metric=metric, names=self.names)
 
     def locatable(self, spheres: ScanSpheres) -> _ImagesToRegister:
-        """Those that show four of the spheres, by which a camera can be located."""
+        """Return the images that show four of the spheres, by which a camera can be located."""
         shown = identify(self.outlines, self.posed(metric=True), spheres)
         kept = [i for i, assigned in enumerate(shown) if len(assigned.markers) >= _LEAST_SPHERES]
         return replace(
@@ -150,12 +150,12 @@ class _ImagesToRegister:
         )
 
     def known(self, T_scan_camera: Array) -> dict[str, Transform]:
-        """The poses that are known, by image."""
+        """Return the poses that are known, by image."""
         pairs = enumerate(zip(self.names, T_scan_camera, strict=True))
         return {name: T for i, (name, T) in pairs if i not in self.left_out and np.isfinite(T).all()}
 
     def station(self, group: int) -> str:
-        """The station whose images form a group."""
+        """Return the station whose images form a group."""
         return next(image.station for image, g in zip(self.images, self.groups, strict=True) if g == group)
 
 
@@ -181,7 +181,7 @@ def _posed_images(context: JobContext[job.Arguments]) -> _ImagesToRegister:
 
 
 def _located_images(context: JobContext[job.Arguments], camera: CameraModel) -> _ImagesToRegister:
-    """The images whose spheres determine their poses; of an arm whose mount is unknown, or of a turntable."""
+    """Return the images whose spheres determine their poses; of an arm whose mount is unknown, or of a turntable."""
     arguments = context.arguments
     searched = read_outlines(context.input_json, arguments.outlines, arguments.images, camera)
     spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m)
@@ -223,7 +223,7 @@ def _placed(
     answer: RegistrationResult,
     placing: RegistrationResult,
 ) -> _Placed:
-    """The scan as `answer` has it, and the cameras as `placing` has them."""
+    """Return the scan as `answer` has it, and the cameras as `placing` has them."""
     arguments = context.arguments
     stated = answer
     if arguments.tracks is not None:
@@ -307,7 +307,7 @@ def _record(
 def _with_contradictions(
     record: job.Registration, images: _ImagesToRegister, solved: PipelineResult
 ) -> job.Registration:
-    """The record with what contradicts in the inputs."""
+    """Return the record with what contradicts in the inputs."""
     beyond = solved.beyond
     found: dict[str, object] = {
         "findings": tuple(job.Contradiction(**asdict(one)) for one in solved.findings),

@@ -116,7 +116,7 @@ class ArmModel:
         return tuple(int(i) for i in np.flatnonzero((np.abs(np.sin(self.alpha_rad)) < _PARALLEL) & (self.a_m != 0)))
 
     def joint_values(self, joints_rad: Array) -> Array:
-        """(K, N, 4) nominal a, d, α, θ for joints (K, N)."""
+        """Return (K, N, 4) nominal a, d, α, θ for joints (K, N)."""
         rest = np.stack([self.a_m, self.d_m, self.alpha_rad], axis=1)
         return np.concatenate(
             [np.broadcast_to(rest, (len(joints_rad), self.axes, 3)), joints_rad[:, :, None]], axis=2
@@ -130,7 +130,7 @@ FITS_RAD = math.radians(2.0)
 
 
 def flange_pose(arm: ArmModel, joints_rad: Array) -> Transform:
-    """T_base_flange (4, 4) at joints (N,) with the nominal parameters.
+    """Return T_base_flange (4, 4) at joints (N,) with the nominal parameters.
 
     In plain floats: an arm sends 125 samples a second, and one product of small arrays costs as much as all this.
     """
@@ -169,7 +169,7 @@ GROUP = "orthocapture.arms"
 
 @cache
 def known_arms() -> tuple[ArmModel, ...]:
-    """All arms, ordered by name of their entry points."""
+    """Return all arms, ordered by name of their entry points."""
     found: list[ArmModel] = []
     for point in plug_ins(GROUP):
         arm: object = point.load()
@@ -184,7 +184,7 @@ def known_arms() -> tuple[ArmModel, ...]:
 
 
 def arm_model(name: str) -> ArmModel:
-    """The arm of this name, in upper or lower case.
+    """Return the arm of this name, in upper or lower case.
 
     Raises:
         ConfigurationError: the name is unknown.
@@ -199,5 +199,5 @@ def arm_model(name: str) -> ArmModel:
 
 
 def known_arm(name: str) -> ArmModel | None:
-    """The arm of this name, or None if it is not known."""
+    """Return the arm of this name, or None if it is not known."""
     return next((arm for arm in known_arms() if arm.name.lower() == name.lower()), None)

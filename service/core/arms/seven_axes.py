@@ -66,7 +66,7 @@ def postures_by_cost(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -
 
 
 def posture_costs(arm: ArmModel, joints_rad: Array, near_rad: Array) -> Array:
-    """(K,) squared travel (rad²) from `near_rad` to joints (K, 7), plus what limits and singularities cost.
+    """Return (K,) squared travel (rad²) from `near_rad` to joints (K, 7), plus what limits and singularities cost.
 
     A joint close to its limit costs, and so does a shoulder, elbow or wrist that is nearly straight.
     """
@@ -85,7 +85,7 @@ def _singular_costs(joints_rad: Array, near_rad: Array) -> Array:
 
 
 def elbow_angle_rad(arm: ArmModel, joints_rad: Array) -> float:
-    """The elbow angle at joints (7,), -π … π."""
+    """Return the elbow angle at joints (7,), -π … π."""
     base, _, _, hand = arm.d_m[::2]
     T = flange_pose(arm, joints_rad)
     wrist = T[:3, 3] - hand * T[:3, 2] - np.array([0.0, 0.0, base])
@@ -107,7 +107,7 @@ def _reference(arm: ArmModel, wrist: Array, q4: float) -> Array:
 
 
 def _zyz(R: Array, side: int) -> Array:
-    """(K, 3) angles with R = Rz Ry Rz, the middle one of this sign; where it is 0 the first is 0."""
+    """Return (K, 3) angles with R = Rz Ry Rz, the middle one of this sign; where it is 0 the first is 0."""
     sine = side * np.hypot(R[:, 0, 2], R[:, 1, 2])
     middle = np.arctan2(sine, R[:, 2, 2])
     first = np.arctan2(side * R[:, 1, 2], side * R[:, 0, 2])
@@ -119,7 +119,7 @@ def _zyz(R: Array, side: int) -> Array:
 
 
 def _about(axis: Array, angles: Array) -> Array:
-    """(K, 3, 3) rotations about a unit axis (3,), by Rodrigues' formula."""
+    """Return (K, 3, 3) rotations about a unit axis (3,), by Rodrigues' formula."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + np.sin(angles)[:, None, None] * K + (1.0 - np.cos(angles))[:, None, None] * (K @ K)

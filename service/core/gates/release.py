@@ -31,7 +31,7 @@ def loses_release(protocol: Protocol, state: RunState, actor: str) -> bool:
 
 
 def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTransitionError | None:
-    """The reason why this person cannot release the run by signing this hash, or None."""
+    """Return the reason why this person cannot release the run by signing this hash, or None."""
     if state.status != "completed":
         return IllegalTransitionError(
             f"the run is {state.status}", where="release", remedy="Only a completed run can be released"
@@ -52,7 +52,7 @@ def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTr
 
 
 def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError | None:
-    """The reason why the run may not be exported yet, for want of a release, or None."""
+    """Return the reason why the run may not be exported yet, for want of a release, or None."""
     if protocol.release == "second_person" and not state.released_by:
         return IllegalTransitionError(
             "the protocol asks for a second person's release before anything is exported",
@@ -64,7 +64,7 @@ def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError
 
 
 def refuse_data_set(state: RunState) -> IllegalTransitionError | None:
-    """The reason why there is no data set of the run yet, or None."""
+    """Return the reason why there is no data set of the run yet, or None."""
     if state.status != "completed":
         return IllegalTransitionError(
             f"the run is {state.status}", where=state.run_id, remedy="Only a completed run is exported"
@@ -76,7 +76,7 @@ _ANSWERS = ("registrations", "accuracy")  # what must be known before a specimen
 
 
 def freed_utc(protocol: Protocol, state: RunState) -> str:
-    """When the specimen was freed, so that nothing can be measured again (ISO 8601, UTC); "" before that.
+    """Return when the specimen was freed, so that nothing can be measured again (ISO 8601, UTC); "" before that.
 
     That is when the first irreversible step that requires a registration or an evaluation passed, or else the end of
     the run.
@@ -93,7 +93,7 @@ def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
 
 
 def late_words(protocol: Protocol, state: RunState, seconds: float) -> str:
-    """A delay in words, such as `arrived 12 min after the specimen was freed`."""
+    """Return a delay in words, such as `arrived 12 min after the specimen was freed`."""
     since = "the specimen was freed" if _freed_by_step_utc(protocol, state) else "the end of the run"
     minutes = round(seconds / 60)
     return f"arrived {minutes} min after {since}" if minutes else f"arrived after {since}"

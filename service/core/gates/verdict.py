@@ -78,7 +78,7 @@ Standing = Literal["within", "not_decided", "accepted", "outside"]
 
 
 def standing(verdict: GateVerdict, *, accepted: bool = False) -> Standing:
-    """The outcome of a gate; `accepted` says that a person let the step pass with its figures as they are."""
+    """Return the outcome of a gate; `accepted` says that a person let the step pass with its figures as they are."""
     if verdict.passed:
         return "within"
     if accepted:
@@ -94,12 +94,12 @@ def describe(verdict: GateVerdict) -> str:
 
 
 def describe_judged(verdict: GateVerdict) -> str:
-    """`describe`, with `: not decided` after an undecided verdict, for a line that stands alone."""
+    """Return `describe`, with `: not decided` after an undecided verdict, for a line that stands alone."""
     return describe(verdict) + (": not decided" if verdict.undecided else "")
 
 
 def figure(verdict: GateVerdict) -> str:
-    """A verdict's value: `0.71 px`, or with its 99 % bounds `0.52 mm, 0.41 to 0.63` (see BOUNDS_HOLD)."""
+    """Return a verdict's value: `0.71 px`, or with its 99 % bounds `0.52 mm, 0.41 to 0.63` (see BOUNDS_HOLD)."""
     if verdict.value is None or verdict.lower is None or verdict.upper is None:
         return quantity(verdict.value, verdict.unit)
     return uncertain(verdict.value, verdict.lower, verdict.upper, verdict.unit)
@@ -112,7 +112,7 @@ def uncertain(value: float, lower: float, upper: float, unit: str = "") -> str:
 
 
 def quantity(value: float | None, unit: str = "") -> str:
-    """A number with its unit, for people: `8 images`, `1 image`, `0.71 px`; `not measured` for None."""
+    """Return a number with its unit, for people: `8 images`, `1 image`, `0.71 px`; `not measured` for None."""
     if value is None:
         return "not measured"
     if value == 1 and unit.endswith("s") and unit not in _UNITS_IN_S:

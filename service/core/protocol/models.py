@@ -68,7 +68,7 @@ class Reasons(Record):
 
 
 def full_reason(preset: str, own: str) -> str:
-    """The reason that is recorded: the chosen preset, then the operator's own words."""
+    """Return the reason that is recorded: the chosen preset, then the operator's own words."""
     return ": ".join(part for part in (preset.strip(), own.strip()) if part)
 
 
@@ -263,7 +263,7 @@ class Step(StepFields):
         return self.confirm or self.moves_robot
 
     def params_as(self, model: type[ParamsT]) -> ParamsT:
-        """The params, typed. Raises ProtocolError when the step is of another kind."""
+        """Return the params, typed. Raises ProtocolError when the step is of another kind."""
         if not isinstance(self.params, model):
             raise ProtocolError(f"the params of this step are not {model.__qualname__}", where=f"step {self.id}")
         return self.params
@@ -298,11 +298,11 @@ class Protocol(ProtocolFields):
         return tuple(step.id for step in self.steps)
 
     def step(self, step_id: str) -> Step:
-        """The step with this identifier. Raises ProtocolError if there is none."""
+        """Return the step with this identifier. Raises ProtocolError if there is none."""
         return self.steps[self.index(step_id)]
 
     def index(self, step_id: str) -> int:
-        """The step's position. Raises ProtocolError if there is none."""
+        """Return the step's position. Raises ProtocolError if there is none."""
         try:
             return self.step_ids.index(step_id)
         except ValueError:
@@ -378,7 +378,7 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]]
 def _validate_params(
     data: Mapping[str, Plain], models: Mapping[str, type[StepParams]], tree: YamlTree, problems: list[YamlProblem]
 ) -> dict[int, StepParams]:
-    """The params of every valid step by its index; appends what is wrong with the others to `problems`."""
+    """Return the params of every valid step by its index; appends what is wrong with the others to `problems`."""
     params: dict[int, StepParams] = {}
     steps = data.get("steps")
     for index, step in enumerate(steps if isinstance(steps, list) else []):
@@ -405,7 +405,7 @@ def _refuse(problems: list[YamlProblem], name: str) -> NoReturn:
 
 
 def protocol_json_schema(params_models: Mapping[str, type[StepParams]]) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of a protocol file for editors, with the params of every step kind."""
+    """Return the JSON Schema (draft 2020-12) of a protocol file for editors, with the params of every step kind."""
     kinds: list[type[BaseModel]] = []
     for kind, model in sorted(params_models.items()):
         needed = any(field.is_required() for field in model.model_fields.values())

@@ -98,7 +98,7 @@ class NamesStep:
 
 
 def names_step(does: str, *gives: Gives) -> NamesStep:
-    """The mark of a field that names a step whose result is one of these."""
+    """Return the mark of a field that names a step whose result is one of these."""
     return NamesStep(does, lambda params: params.gives in gives)
 
 
@@ -113,7 +113,7 @@ NAMES_CAPTURE = NamesStep(
 
 
 def named_steps(params: BaseModel) -> Iterator[tuple[tuple[str | int, ...], str, NamesStep]]:
-    """Every step that params name: the place of the name in them, the name, and the mark of its field."""
+    """Yield every step that params name: the place of the name in them, the name, and the mark of its field."""
     for field, info in type(params).model_fields.items():
         value: object = getattr(params, field)
         mark = next((one for one in info.metadata if isinstance(one, NamesStep)), None)

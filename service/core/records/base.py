@@ -16,7 +16,7 @@ class Record(BaseModel):
 
 
 def recorded(record: Record) -> dict[str, Any]:
-    """A record as it is written into an event: all of its own fields; of the records in it, the fields that were set.
+    """Return a record as it is written into an event: all of its own fields, and the set fields of records in it.
 
     So a part that was read from an earlier event is written again exactly as it was.
     """
@@ -86,7 +86,7 @@ def elapsed(earlier: Moment, later: Moment) -> Elapsed:
 
 
 def age_s(since_utc_s: float, now_utc_s: float, *, if_set_back_s: float) -> float:
-    """The time in seconds since a moment that was recorded in UTC alone, which is never negative.
+    """Return the time in seconds since a moment that was recorded in UTC alone, which is never negative.
 
     A moment later than now by more than `elapsed` tolerates shows that the clock was set back, so that its age is not
     known: `if_set_back_s` is then the answer, which the caller chooses on the safe side (infinity ends a sign-in; 0
@@ -97,7 +97,7 @@ def age_s(since_utc_s: float, now_utc_s: float, *, if_set_back_s: float) -> floa
 
 
 def _within_one_boot(utc_s: float, monotonic_s: float) -> Elapsed:
-    """The time where the two clocks disagree within one boot."""
+    """Return the time where the two clocks disagree within one boot."""
     if monotonic_s < 0:
         return Elapsed(None, f"the monotonic clock ran back by {-monotonic_s:.0f} s within one boot")
     if utc_s > monotonic_s:

@@ -63,7 +63,7 @@ class Party:
 
 
 def party(text: str, *, otherwise: Literal["Person", "Organization", ""] = "") -> Party:
-    """A person or body from a line: its name, and an ORCID or a ROR if it has one.
+    """Return a person or body from a line: its name, and an ORCID or a ROR if it has one.
 
     `person: NAME` or `organisation: NAME` says which it is where neither is given and the name does not show it.
     `otherwise` is what it is where nothing says it; "": as the name sounds.
@@ -99,7 +99,7 @@ def _likely(name: str) -> Literal["Person", "Organization"]:
 
 
 def _checked_orcid(text: str) -> str:
-    """The ORCID in groups of four. Raises DataError unless its check digit (ISO 7064, mod 11-2) is right."""
+    """Return the ORCID in groups of four. Raises DataError unless its check digit (ISO 7064, mod 11-2) is right."""
     digits = text.replace("-", "").upper()
     total = 0
     for digit in digits[:-1]:
@@ -113,7 +113,7 @@ def _checked_orcid(text: str) -> str:
 
 
 def _checked_ror(text: str) -> str:
-    """The ROR in lower case. Raises DataError unless form and check digits (ISO 7064, mod 97-10) are right."""
+    """Return the ROR in lower case. Raises DataError unless form and check digits (ISO 7064, mod 97-10) are right."""
     ror = text.lower()
     value = 0
     for digit in ror[:7] if _ROR_FORM.fullmatch(ror) else "":
@@ -124,7 +124,7 @@ def _checked_ror(text: str) -> str:
 
 
 def doi_address(text: str) -> str:
-    """The address of a DOI, which may be given with or without `doi:` or `https://doi.org/`; "" for "".
+    """Return the address of a DOI, which may be given with or without `doi:` or `https://doi.org/`; "" for "".
 
     Raises:
         DataError: it has another form.
@@ -138,7 +138,7 @@ def doi_address(text: str) -> str:
 
 
 def licence_address(text: str) -> str:
-    """The address of a licence, from its SPDX identifier or its own address; "" for "".
+    """Return the address of a licence, from its SPDX identifier or its own address; "" for "".
 
     Raises:
         DataError: it is neither; the remedy names the identifier that is probably meant.
@@ -171,7 +171,7 @@ def licence_address(text: str) -> str:
 
 
 def licence_name(address: str) -> str:
-    """The SPDX identifier in an address that has one; else the address."""
+    """Return the SPDX identifier in an address that has one; else the address."""
     return address.removeprefix(_SPDX).removesuffix(".html") if address.startswith(_SPDX) else address
 
 
@@ -196,7 +196,7 @@ class DataSetStatement(Record):
     funders: tuple[_Name, ...] = ()  # bodies that paid for it, each with its ROR if possible
 
     def or_else(self, other: DataSetStatement) -> DataSetStatement:
-        """This statement, with what it leaves out taken from another."""
+        """Return this statement, with what it leaves out taken from another."""
         return DataSetStatement(
             title=self.title or other.title,
             licence=self.licence or other.licence,

@@ -81,14 +81,14 @@ def require_specimen(about: RunAbout) -> None:
 
 
 def about_rows(about: RunAbout | None) -> list[tuple[str, str]]:
-    """(label, text) of each field that was filled in; empty for a run without them."""
+    """Return (label, text) of each field that was filled in; empty for a run without them."""
     if about is None:
         return []
     return [(name, value) for field, name in ABOUT.items() if (value := str(getattr(about, field)))]
 
 
 def line(entered: str, what: str) -> str:
-    """`entered` as one line without control characters.
+    """Return `entered` as one line without control characters.
 
     Raises ConfigurationError, which calls the text `what`, if it is longer than LINE_CHARACTERS.
     """

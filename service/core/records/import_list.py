@@ -55,12 +55,12 @@ class ImportList(Record):
         return any(view.role == role for view in self.views) or any(name == role for name in self.files)
 
     def all_files(self) -> tuple[ImportedFile, ...]:
-        """Every file to be imported."""
+        """Return every file to be imported."""
         photographs = [file for view in self.views for file in (view.photograph, *view.raws)]
         return (*photographs, *(file for files in self.files.values() for file in files))
 
     def check(self, path: str, sha256: str) -> ImportedFile:
-        """The list's entry for a file that is being imported.
+        """Return the list's entry for a file that is being imported.
 
         Raises DataError if the file is not in the list, or if its bytes have changed since it was listed.
         """
@@ -78,11 +78,11 @@ class ImportList(Record):
         return found
 
     def absolute(self, file: ImportedFile) -> str:
-        """The absolute path of a file."""
+        """Return the absolute path of a file."""
         return file.path if file.path.startswith("/") else f"{self.folder}/{file.path}"
 
 
 def imported_sentence(at_utc: str, by: str) -> str:
-    """The sentence with which every page and report on an imported run begins."""
+    """Return the sentence with which every page and report on an imported run begins."""
     when = f"{at_utc[:16].replace('T', ' ')} UTC"
     return f"The photographs were imported on {when} by {by}; how the images were captured is not in evidence"

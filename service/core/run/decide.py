@@ -155,7 +155,7 @@ def _what_goes_on(step: Step, state: RunState) -> str:
 
 
 def lapsed_words(lapse: Lapse) -> str:
-    """Why a confirmation no longer holds."""
+    """Say why a confirmation no longer holds."""
     waited = f", in which the run waited for this: {lapse.why}" if lapse.why else ""
     return (
         f"The confirmation of {lapse.by} no longer lets the robot move: for {lapse.idle_s:.0f} s there was no "

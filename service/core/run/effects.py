@@ -63,7 +63,7 @@ from service.core.run.state_transitions import NOT_WAITING, UNMEASURED, change, 
 
 
 def impossible(event: Event, why: str) -> IntegrityError:
-    """The error for an event that cannot have happened in its place."""
+    """Return the error for an event that cannot have happened in its place."""
     return IntegrityError(
         f"{event.payload.kind} cannot have happened here: {why}",
         where=f"run {event.run_id} event {event.seq}",
@@ -72,7 +72,7 @@ def impossible(event: Event, why: str) -> IntegrityError:
 
 
 def triggered(protocol: Protocol, state: RunState, event: Event, trigger: str, **changes: Any) -> RunState:
-    """The state after a trigger of the lifecycle. Raises IntegrityError if it is not allowed now."""
+    """Return the state after a trigger of the lifecycle. Raises IntegrityError if it is not allowed now."""
     try:
         return go(protocol, state, trigger, **changes)
     except IllegalTransitionError as error:
@@ -103,7 +103,7 @@ def is_void(state: RunState, event: Event, step: str, attempt: int, *, when_comp
 
 
 def is_void_now(state: RunState, event: Event, step: str, attempt: int) -> bool:
-    """`is_void` for events that only the current step can produce. Raises IntegrityError for another step."""
+    """Return `is_void` for events that only the current step can produce. Raises IntegrityError for another step."""
     if is_void(state, event, step, attempt):
         return True
     if step != state.current:
@@ -141,7 +141,7 @@ def device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceT
 
 
 def lost(arm: ArmConnection, seq: int, at_utc: str, how: str) -> ArmConnection:
-    """An arm whose connection was lost, since the first loss that nobody has looked at."""
+    """Return an arm whose connection was lost, since the first loss that nobody has looked at."""
     since_utc = at_utc if arm.loss is None else arm.loss.since_utc
     return replace(arm, connected=False, loss=Loss(seq, since_utc, how), lost_utc=at_utc, seen_by="", seen_utc="")
 
@@ -185,7 +185,7 @@ def leave_lapsed(protocol: Protocol, state: RunState, event: Event, p: LeaveLaps
 
 
 def with_arm(state: RunState, name: str, arm: ArmConnection) -> RunState:
-    """The state with another record of one arm."""
+    """Return the state with another record of one arm."""
     return replace(state, arms={**state.arms, name: arm})
 
 

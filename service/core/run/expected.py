@@ -48,7 +48,7 @@ def usual_time(protocol: Protocol, state: RunState, step: Step, earlier: Earlier
 def work_words(
     protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str, clock: Callable[[str], str]
 ) -> str:
-    """How long the work under way usually takes, and whether it has taken too long; "" while none is under way."""
+    """Say how long the work under way usually takes, and if it has taken too long; "" while none is under way."""
     now = state.step
     if state.status != "active" or now.phase != "running" or needs_leave(protocol, state) or not now.work_began_utc:
         return ""
@@ -101,7 +101,7 @@ def away_words(
 
 
 def step_words(protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes) -> str:
-    """How long a step that is still to be done usually takes; "" where that is not known, or the step is done."""
+    """Say how long a step that is still to be done usually takes; "" where that is not known, or the step is done."""
     usual = usual_time(protocol, state, step, earlier)
     if state.terminal or usual is None or state.steps[step.id].phase == "passed":
         return ""
@@ -109,7 +109,7 @@ def step_words(protocol: Protocol, state: RunState, step: Step, earlier: Earlier
 
 
 def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str) -> str:
-    """How long the work that is left of a run usually takes, without the times for which it waits for people."""
+    """Say how long the work that is left of a run usually takes, without the times for which it waits for people."""
     if state.terminal:
         return ""
     left_s, known = 0.0, 0
@@ -128,14 +128,14 @@ def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_ut
 
 
 def _left_s(usual: UsualTime, now: StepState | None, now_utc: str) -> float:
-    """The seconds that the work of a step usually still takes; all of them where it is not under way."""
+    """Return the seconds that the work of a step usually still takes; all of them where it is not under way."""
     if now is None or not now.work_began_utc:
         return usual.seconds
     return max(0.0, usual.seconds - now.work_s(now_utc))
 
 
 def duration(seconds: float) -> str:
-    """`40 s`, `12 min`, `1 h 05 min`."""
+    """Return `40 s`, `12 min`, `1 h 05 min`."""
     if seconds < 90:
         return f"{max(round(seconds / 5) * 5, 5)} s"
     minutes = round(seconds / 60)
@@ -172,7 +172,7 @@ def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str]
 
 
 def failed_words(tries: FailedTries) -> str:
-    """`b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
+    """Return `b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
     times = _TIMES[tries.times] if tries.times < len(_TIMES) else f"{tries.times} times"
     return f"{tries.what or 'The step'} failed {times}: {what_of(tries.message)}"
 

@@ -22,7 +22,7 @@ Lane = Literal["waited", "background"]
 
 
 def lane_of(priority: int) -> Lane:
-    """`waited` if a step or a person waits for jobs of this priority, else `background`."""
+    """Return `waited` if a step or a person waits for jobs of this priority, else `background`."""
     return "waited" if priority < EARLY else "background"
 
 
@@ -68,12 +68,12 @@ ENDINGS: Mapping[str, str] = {
 
 
 def lost_arms(state: RunState) -> dict[str, Loss]:
-    """The arms that count as moving because a connection was lost and nobody has looked since, by name."""
+    """Return the arms that count as moving because a connection was lost and nobody has looked since, by name."""
     return {name: arm.loss for name, arm in state.arms.items() if arm.loss is not None}
 
 
 def connected_arms(state: RunState) -> tuple[str, ...]:
-    """The arms to which a connection is open, as far as the record knows."""
+    """Return the arms to which a connection is open, as far as the record knows."""
     return tuple(name for name, arm in state.arms.items() if arm.connected)
 
 

@@ -69,7 +69,7 @@ class TextTable:
 
 
 def decoded(data: bytes, where: str, *, numbers_only: bool = False) -> str:
-    """The text of UTF-8 or UTF-16, with or without a byte order mark.
+    """Return the text of UTF-8 or UTF-16, with or without a byte order mark.
 
     Args:
         data: the whole file.
@@ -113,7 +113,7 @@ def is_number(cell: str) -> bool:
 
 
 def read_table(data: bytes, where: str, *, numbers_only: bool = False) -> TextTable:
-    """The fields of a file of delimited text.
+    """Return the fields of a file of delimited text.
 
     Raises:
         DataError: another encoding, a quote that is not closed, or a form that can be read in two ways; `where` has
@@ -198,7 +198,7 @@ def _lenient(line: str, separator: str) -> list[str]:
 
 
 def _separator(lines: Iterable[str]) -> str:
-    """The separator that each line has; a comma before a semicolon or a space can be a decimal comma."""
+    """Return the separator that each line has; a comma before a semicolon or a space can be a decimal comma."""
     bare = [re.sub(r'"[^"]*"', '""', line) for line in lines]
     bare = [line for line in bare if _ENDS_IN_NUMBER.search(line)] or bare  # not the titles above a table
     for candidate in (";", "\t"):

@@ -12,12 +12,12 @@ from service.core.text.delimited_text import decoded, read_table
 
 
 def file_text(path: Path) -> str:
-    """The text of a UTF-8 or UTF-16 file, with or without a mark. Raises DataError if it cannot be read."""
+    """Return the text of a UTF-8 or UTF-16 file, with or without a mark. Raises DataError if it cannot be read."""
     return decoded(file_bytes(path), str(path))
 
 
 def file_bytes(path: Path) -> bytes:
-    """The content of a file. Raises DataError if it cannot be read."""
+    """Return the content of a file. Raises DataError if it cannot be read."""
     try:
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: an impossible path, such as one with a null byte

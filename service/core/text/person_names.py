@@ -52,7 +52,7 @@ _UNSEEN = frozenset(
 
 
 def person_name(typed: str) -> str:
-    """The name that was typed, in the one form in which names are stored.
+    """Return the name that was typed, in the one form in which names are stored.
 
     Raises ConfigurationError if it is not a person's name, or one that the software itself acts under.
     """
@@ -84,7 +84,7 @@ def _same_form(typed: str) -> str:
 
 
 def _faults(name: str) -> Iterator[str]:
-    """Why a text is no name; nothing if it is one."""
+    """Yield why a text is no name; nothing if it is one."""
     if not name:
         yield "it is empty"
         return
@@ -109,7 +109,7 @@ def _faults(name: str) -> Iterator[str]:
 
 
 def _unusual(character: str) -> str:
-    """Why no name has this character, apart from those between its parts; "" if names have it."""
+    """Return why no name has this character, apart from those between its parts; "" if names have it."""
     category, script = unicodedata.category(character), _script(character)
     base = unicodedata.normalize("NFKD", character)[0]
     if category == "Nd" and not character.isascii():

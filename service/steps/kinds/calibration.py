@@ -171,7 +171,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def board_of_protocol(context: StepContext) -> Board:
-    """The protocol's board. Raises ConfigurationError if it describes none."""
+    """Return the protocol's board. Raises ConfigurationError if it describes none."""
     from service.compute.board.board import Board  # noqa: PLC0415 - as above
 
     board = context.protocol.board
@@ -183,7 +183,7 @@ def board_of_protocol(context: StepContext) -> Board:
 
 
 def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Answer] | None:
-    """The answer with the intrinsics of an earlier step, if this one does not solve them."""
+    """Return the answer with the intrinsics of an earlier step, if this one does not solve them."""
     if "intrinsics" in params.solve:
         return None
     if params.intrinsics_of is None:
@@ -209,7 +209,7 @@ def _board_capture(
 
 
 def _as_board_poses(sets: tuple[ViewpointSet, ...]) -> BoardPoses:
-    """The planning parameters for replacements of listed viewpoints."""
+    """Return the planning parameters for replacements of listed viewpoints."""
     arcs = [arc for one in sets for arc in one.arcs]
     offset = sets[-1].aim_offset_m[2]
     return BoardPoses(

@@ -134,7 +134,7 @@ def _labels(
 
 
 def _sound(ct: CtSource) -> Sequence[CtSeries]:
-    """The series without faults, oldest first.
+    """Return the series without faults, oldest first.
 
     Raises DataError if the newest is one of several in the same frame of reference, such as the products of one
     acquisition of a photon-counting suite: all show the specimen, with other values.

@@ -181,7 +181,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _regions(context: StepContext, params: Params) -> tuple[fuse.Region, ...]:
-    """The regions of the protocol, then those that people drew for this step on the 3D view."""
+    """Return the regions of the protocol, then those that people drew for this step on the 3D view."""
     author = f"protocol {context.protocol.id} {context.protocol.version}"
     drawn = (found for found in context.run.drawn if found.region.step == context.step.id)
     return (
@@ -220,7 +220,7 @@ def _region(region: WoundRegion, author: str) -> fuse.Region:
 
 
 def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> tuple[str, JobState, JobState]:
-    """The name of the registration that is used, its job for the scan, and the same for the CT."""
+    """Return the name of the registration that is used, its job for the scan, and the same for the CT."""
     found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(step))
     arrived = {} if found is None else found.arrived
     waited = decisive(context.protocol, context.protocol.step(step))

@@ -102,7 +102,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _earlier(context: StepContext) -> list[layout.LayoutPhotograph]:
-    """The photographs of the present layout: those taken since a sphere was last moved."""
+    """Return the photographs of the present layout: those taken since a sphere was last moved."""
     images: list[layout.LayoutPhotograph] = []
     for note in context.state.notes:
         if note.note == MOVE_WANTED:

@@ -183,7 +183,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _search(context: StepContext, params: Params) -> JobRequest:
-    """The search for outlines; the jobs after it share most of its arguments."""
+    """Return the search for outlines; the jobs after it share most of its arguments."""
     images = captured_images(context, [*params.images_of, *params.control_images_of])
     if not posed(images) and not set(params.poses) <= {"colmap", "glomap"}:
         raise ConfigurationError(
@@ -227,7 +227,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
 
 
 def _mounting(context: StepContext, params: Params, images: list[PosedPhotograph]) -> CameraMounting:
-    """How the camera was mounted on the arm; empty where a person held it."""
+    """Return how the camera was mounted on the arm; empty where a person held it."""
     steps = (params.hand_eye,) if isinstance(params.hand_eye, str) else params.hand_eye or ()
     if not steps:
         return CameraMounting(Mounting(), {})
@@ -249,7 +249,7 @@ def _words(found: RegistrationJobs) -> str:
 
 
 def _outcome(found: RegistrationJobs) -> StepOutcome:
-    """The registrations so far, including any that arrived although the step did not wait for them."""
+    """Return the registrations so far, including any that arrived although the step did not wait for them."""
     done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
     outlines = next(job for task, job in done if task.request.kind == detect_spheres.KIND.name)
     registrations = {name: OneRegistration.read(job.measures) for name, job in found.arrived.items()}
@@ -275,7 +275,7 @@ def _tell_findings(context: StepContext, outcome: StepOutcome) -> None:
 
 
 def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]) -> StepOutcome:
-    """The outcome with the poses of the further cameras, and the measures of the worst of them."""
+    """Return the outcome with the poses of the further cameras, and the measures of the worst of them."""
     if not located:
         return outcome
     measured = [job.measures for job in located.values()]

@@ -187,7 +187,7 @@ def _age(context: StepContext, application: str) -> dict[str, float]:
 
 
 def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) -> JobRequest:
-    """The search in the only mesh, or the merging of several and the search in what results."""
+    """Return the search in the only mesh, or the merging of several and the search in what results."""
     arguments, references = _arguments(context, params, meshes[0])
     if len(meshes) == 1:
         return JobRequest.of(locate_spheres.KIND, arguments, references)
@@ -204,7 +204,7 @@ def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) ->
 def _arguments(
     context: StepContext, params: Params, mesh: ArtefactRef
 ) -> tuple[locate_spheres.Arguments, dict[str, Reference | None]]:
-    """The arguments of the search, with the spheres to compare with, and the references to these."""
+    """Return the arguments of the search, with the spheres to compare with, and the references to these."""
     arguments = locate_spheres.Arguments(
         mesh=mesh.sha256, radius_m=metres(context.protocol.spheres.radius_mm), expected=params.spheres
     )

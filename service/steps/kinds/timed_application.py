@@ -60,7 +60,7 @@ class Result(Record):
 
 
 def applied_at(notes: Sequence[Note]) -> Moment | None:
-    """When the product was applied, by the notes of such a step; None if it was not yet."""
+    """Return when the product was applied, by the notes of such a step; None if it was not yet."""
     for noted in notes:
         note = _Applied.model_validate(noted.data)
         if note.applied_monotonic_s is not None:

@@ -158,7 +158,7 @@ class _Capture:
         return totals, spoilt
 
     def of_images(self, images: Collection[str]) -> list[Viewpoint]:
-        """The viewpoints at which these images (SHA-256) were taken."""
+        """Return the viewpoints at which these images (SHA-256) were taken."""
         captures = self._context.evidence.captures(self._context.step.id)
         taken = {capture.viewpoint for capture in captures if capture.artefacts[0].sha256 in images}
         return [viewpoint for viewpoint in self.viewpoints if viewpoint.name in taken]

@@ -21,7 +21,7 @@ _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
 
 def lbr_r820(name: str) -> ArmModel:
-    """An LBR with a reach of 820 mm, which is made for industry (iiwa) and for medical devices (Med).
+    """Return an LBR with a reach of 820 mm, which is made for industry (iiwa) and for medical devices (Med).
 
     Source: KUKA, specifications "LBR iiwa 7 R800, LBR iiwa 14 R820" and "LBR Med": dimensions, axis ranges, speeds.
     """
