@@ -211,7 +211,7 @@ def _views(places: ImportFolders, progress: Progress) -> tuple[list[ImportedView
 
 
 def camera_record(exif: ExifRecord) -> dict[str, Any]:
-    """Camera, lens and settings stated in a photograph's EXIF, with the keys used in capture events."""
+    """Return camera, lens and settings given in a photograph's EXIF, with the keys used in capture events."""
     stated: dict[str, Any] = {
         "make": exif.make,
         "model": exif.model,
@@ -334,7 +334,7 @@ def _ct(folder: Path, reading: CtReading) -> tuple[tuple[Path, ...], list[LeftOu
 
 
 def _elsewhere(places: ImportFolders) -> list[LeftOut]:
-    """Files of the folder that are in none of its parts."""
+    """Return the files of the folder that are in none of its parts."""
     parts = [
         place
         for place in (

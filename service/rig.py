@@ -98,7 +98,7 @@ class LensSection(Record):
     tolerance: Annotated[float, Field(gt=0, lt=0.5)] = 0.025  # of the focal length, relative
 
     def focal_px(self, width_px: int) -> float:
-        """Focal length in pixels for images of this width, with the lens's extension at close focus."""
+        """Return the focal length in pixels for images of this width, with the lens's extension at close focus."""
         f_m = metres(self.focal_length_mm)
         extended = 1.0 if self.focus_distance_m is None else self.focus_distance_m / (self.focus_distance_m - f_m)
         return self.focal_length_mm * extended / self.sensor_width_mm * width_px

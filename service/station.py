@@ -255,7 +255,7 @@ class Station:
         return self.rig.section.collision, self.rig.section.optics
 
     def lens(self) -> LensSection | None:
-        """Focal length and sensor in the rig file, or None."""
+        """Return focal length and sensor in the rig file, or None."""
         return self.rig.section.lens
 
     def imported(self) -> ImportList | None:

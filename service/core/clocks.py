@@ -57,7 +57,7 @@ def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOff
 
 
 def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[float, float] | None:
-    """Offset and resolution of the stated times, in seconds."""
+    """Return offset and resolution of the recorded times, in seconds."""
     first, second = (_time(recorded_optics(camera).exif_time) for camera in (capture.camera, exposure.camera))
     if first is None or second is None or (first[0].tzinfo is None) != (second[0].tzinfo is None):
         return None
@@ -247,7 +247,7 @@ def _drift(name: str, opened: Event, captures: tuple[Event, Event] | None) -> Cl
 
 
 def _exif_offset_s(event: Event) -> float | None:
-    """Camera clock minus host UTC at the release, in seconds; None if EXIF has no offset from UTC."""
+    """Return the camera's clock minus host UTC at the release, in seconds; None if EXIF has no offset from UTC."""
     payload = event.payload
     assert isinstance(payload, ViewpointCaptured)
     try:

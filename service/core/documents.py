@@ -72,7 +72,7 @@ def lifecycle_text(protocol: Protocol) -> str:
 
 
 def run_diagram(steps: Iterable[Step]) -> list[str]:
-    """Lines of a Mermaid diagram: the steps in order inside the run, with pause and end around it."""
+    """Return the lines of a Mermaid diagram: the steps in order inside the run, with pause and end around it."""
     known = {step.id: step for step in steps}
     inside, around = dict[str, None](), dict[str, None]()  # ordered sets
     for trigger, source, target in transition_table(tuple(known)):
@@ -98,7 +98,7 @@ def run_diagram(steps: Iterable[Step]) -> list[str]:
 
 
 def step_diagram() -> list[str]:
-    """Lines of a Mermaid diagram: the phases of a step."""
+    """Return the lines of a Mermaid diagram: the phases of a step."""
     return [
         "stateDiagram-v2",
         f"    [*] --> {PHASES[0]}",

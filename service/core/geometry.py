@@ -24,7 +24,7 @@ def transform(rotation: Array | Rotation, translation_m: Array) -> Transform:
 
 
 def _rotations() -> type[Rotation]:
-    """SciPy's rotations, imported on first use: half a second, which most commands do without."""
+    """Import SciPy's rotations on first use: it takes half a second, which most commands do without."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     return Rotation
@@ -110,7 +110,7 @@ def look_at(eye: Array, target: Array, up: Array) -> Transform:
 
 
 def rotation_angle_rad(T: Transform) -> float:
-    """Angle of the rotation part in radians, 0 to pi."""
+    """Return the angle of the rotation part in radians, 0 to pi."""
     return float(_rotations().from_matrix(T[:3, :3]).magnitude())
 
 

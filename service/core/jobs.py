@@ -143,7 +143,7 @@ def references_in(value: object) -> Iterator[Reference | Each]:
 
 
 def resolve(value: Any, jobs: Jobs) -> Any:
-    """Recorded arguments with every reference replaced by the value it refers to.
+    """Return recorded arguments with every reference replaced by the value it refers to.
 
     Raises:
         IntegrityError: a job is not among `jobs`, has not finished, or its answer has no such part.

@@ -188,7 +188,7 @@ def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
 
 
 def picture_size(data: bytes, where: str = "its first bytes") -> tuple[int, int]:
-    """Width and height of a JPEG or PNG in pixels as stored, from its header; the rest may be missing.
+    """Return width and height of a JPEG or PNG in pixels as stored, from its header; the rest may be missing.
 
     Raises:
         DataError: it is neither, or its header is damaged or missing.
@@ -230,7 +230,7 @@ def _segments(data: bytes, where: str) -> Iterator[tuple[int, int]]:
 
 
 def _frame_size(data: bytes, at: int) -> tuple[int, int]:
-    """Width and height of a frame header that begins at `at`."""
+    """Return width and height of a frame header that begins at `at`."""
     return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
 
 

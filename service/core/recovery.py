@@ -166,7 +166,7 @@ def planned_sets(step: Step) -> tuple[Any, ...]:
 
 
 def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
-    """Seconds for one view: the median of this run's, else from the arm's plan; None if neither is known."""
+    """Return the seconds for one view: this run's median, else from the arm's plan; None if neither is known."""
     if state.view_gaps_s:
         return median(state.view_gaps_s)
     return state.steps[step.id].motion_plan.view_s
@@ -203,7 +203,7 @@ def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
 
 
 def _computing(worked_s: float | None, views: int, each_s: float | None) -> float | None:
-    """Minutes of computing after the views are taken: the work so far less the time for `views`."""
+    """Return the minutes of computing after the views are taken: the work so far less the time for `views`."""
     return None if worked_s is None or each_s is None else max(worked_s - views * each_s, each_s) / 60
 
 
@@ -289,7 +289,7 @@ def _end(protocol: Protocol, state: RunState) -> WayOn:
 
 
 def _took_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
-    """Seconds for doing a step: estimated from the time per view, else what it took in this run; None: not known."""
+    """Return the seconds for doing a step: estimated from the time per view, else what it took; None: not known."""
     now = state.steps[step.id]
     each_s, views = view_s(protocol, state, step), planned_views(step)
     if views and each_s is not None:

@@ -29,7 +29,7 @@ def shown(text: str) -> str:
 
 
 def shown_lines(text: str) -> str:
-    """Lines for a terminal; each is escaped, and the line breaks stay."""
+    """Return lines for a terminal; each is escaped, and the line breaks stay."""
     return "\n".join(map(shown, text.split("\n")))
 
 
@@ -44,12 +44,12 @@ def shown_json(text: str) -> str:
 
 
 def storable(text: str) -> str:
-    """Text that every database takes: NUL and surrogates, which come from bytes that are not text, become escapes."""
+    """Return text that every database takes: NUL and surrogates, which come from other bytes, become escapes."""
     return _NOT_TO_STORE.sub(_escaped, text)
 
 
 def storable_data(value: object) -> object:
-    """Plain data in which every text is `storable`; names of fields too."""
+    """Return plain data in which every text is `storable`; names of fields too."""
     if isinstance(value, str):
         return storable(value)
     if isinstance(value, Mapping):

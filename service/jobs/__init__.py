@@ -28,6 +28,6 @@ _WORDS: Mapping[str, str] = {"ct": "CT series", "control_image": "images of the 
 
 
 def term(name: str) -> str:
-    """Words for a name in the records: `CT surface` for ct_surface; an unknown name with spaces."""
+    """Return the label of a name in the records: `CT surface` for ct_surface; an unknown name with spaces."""
     kind = job_kinds().get(name)
     return kind.words if kind is not None else _WORDS.get(name, name.replace("_", " "))

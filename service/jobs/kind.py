@@ -90,7 +90,7 @@ class JobKind(Generic[A, R]):
     demand: Callable[[A], Demand] = usual_demand
 
     def other_numbers(self, recorded_version: int) -> str:
-        """That another version computed a recorded job, with other numbers or fewer; "" if this one did."""
+        """Say that another version computed a recorded job, with other numbers or fewer; "" if this one did."""
         if max(recorded_version, _FIRST_NUMBERS) == max(self.version, _FIRST_NUMBERS):
             return ""
         return (

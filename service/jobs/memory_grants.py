@@ -182,7 +182,7 @@ def _alone(folder: Path) -> Generator[None]:
 
 
 def _used_mb(pid: int) -> float:
-    """Memory of a process and of those that it started; 0 for one that has ended."""
+    """Return the memory of a process and of those that it started; 0 for one that has ended."""
     try:
         process = psutil.Process(pid)
         return sum(megabytes(one.memory_info().rss) for one in (process, *process.children(recursive=True)))

@@ -21,7 +21,7 @@ def matrix(rows: Iterable[Iterable[float]]) -> Matrix:
 
 
 def matrices(arrays: Mapping[str, Iterable[Iterable[float]]]) -> dict[str, Matrix]:
-    """Arrays by name as a record holds them."""
+    """Return arrays by name as a record holds them."""
     return {name: matrix(rows) for name, rows in arrays.items()}
 
 

@@ -70,7 +70,7 @@ class BoardCapture:
     # --- the loop ---
 
     def take(self) -> dict[str, float]:
-        """Capture, search and plan until nothing is missing; the measures of the capture."""
+        """Capture, search and plan until nothing is missing; return the measures of the capture."""
         begun = False
         while True:
             fresh = self.poses() if not begun else self._new

@@ -130,7 +130,7 @@ def _as_if_measured(known: BoardKnowledge) -> BoardKnowledge:
 def nominal_board(
     wanted: BoardPoses, board: Board, layout: StationLayout, mount: Transform, camera: CameraModel, focal: float
 ) -> BoardKnowledge:
-    """Board, mount and lens as protocol and rig file state them."""
+    """Return board, mount and lens as protocol and rig file give them."""
     tolerances = Tolerances(
         place_m=metres(wanted.place_tolerance_mm), turn_rad=float(np.radians(wanted.turn_tolerance_deg)), focal=focal
     )

@@ -202,7 +202,7 @@ class _JobTimes:
     cores: int
 
     def seconds(self, task: Task) -> float:
-        """Seconds until a task is done, counted from its start; 0 if it is done."""
+        """Return the seconds until a task is done, counted from its start; 0 if it is done."""
         job = task.job
         if job is not None and job.status != "enqueued":
             return 0.0
@@ -215,7 +215,7 @@ class _JobTimes:
         return max(expected_s - max(0.0, gone_s), 0.1 * expected_s)  # negative: the clock was set back
 
     def expected_s(self, kind: str, work: _Work) -> float:
-        """Expected duration of a job, from the jobs of its kind in this run if there are any."""
+        """Return the expected duration of a job, from the jobs of its kind in this run if there are any."""
         jobs = jobs_of(self.state)
         ended = [job for job in jobs.values() if job.kind == kind and job.status == "finished"]
         done = [(job, _work(kind, job.arguments, jobs)) for job in ended]

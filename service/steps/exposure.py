@@ -358,7 +358,7 @@ def wanted_settings(context: StepContext) -> CameraSettings:
 
 
 def environment_now(context: StepContext) -> dict[str, float]:
-    """Light and temperature from the light box; empty without one."""
+    """Read light and temperature from the light box; empty without one."""
     lightbox = context.devices.lightbox()
     if lightbox is None:
         return {}

@@ -100,7 +100,7 @@ def _registration_of(protocol: Protocol, capture: str) -> Step | None:
 def _taken(
     context: StepContext, wanted: WantedRegistrations, station: str, nominal: Transform
 ) -> dict[str, Transform]:
-    """Approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
+    """Return the approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
     earlier = [step for step in wanted.captures if step != context.step.id]
     captures = [c for step in earlier for c in context.evidence.captures(step) if isinstance(c, ViewpointCaptured)]
     return {c.viewpoint: np.array(c.T_base_flange) @ nominal for c in captures if c.station == station}

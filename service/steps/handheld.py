@@ -225,7 +225,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
 
 
 def failure_words(job: JobState) -> str:
-    """Explains a failed job on the images: what it means, and what to do."""
+    """Explain a failed job on the images: what it means, and what to do."""
     why = job.message.rstrip(".")
     if job.kind == coverage_points.KIND.name:
         return (

@@ -271,6 +271,6 @@ def _arm_of(context: StepContext, step_id: str, stations: Sequence[str]) -> _Cal
 
 
 def intrinsics_covariance_of(found: EarlierAnswer[calibrate.Answer]) -> ParameterCovariance | None:
-    """Covariance of a calibration's intrinsics, with the parameters' names; None if it was not computed."""
+    """Return the covariance of a calibration's intrinsics, with the parameters' names; None if not computed."""
     record = found.answer.details.intrinsics
     return None if record is None else record.covariance

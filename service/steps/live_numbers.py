@@ -213,7 +213,7 @@ class LiveAnalysis:
         return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
 
     def spoilt(self) -> dict[str, str]:
-        """Wait for the last images while their jobs go on; the reason of each spoilt image, by its SHA-256.
+        """Wait for the last images while their jobs go on; return the reason of each spoilt image, by its SHA-256.
 
         Raises ImagesSpoiltError after several in a row.
         """

@@ -183,7 +183,7 @@ def plan_step(
 
 
 def _attending(context: StepContext) -> Progress:
-    """Shows how far the planning is and looks at the buttons, at most every `_LOOK_S`."""
+    """Show how far the planning is and look at the buttons, at most every `_LOOK_S`."""
     due_s = context.monotonic_s()
 
     def progress(what: str, done: int, total: int) -> None:
@@ -263,7 +263,7 @@ def feasible_extra(
 
 
 def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Transform) -> Array:
-    """Joints (N,) with the elbow up and the camera above the scene, from which a plan without a robot starts.
+    """Return joints (N,) with the elbow up and the camera above the scene, where a plan without a robot starts.
 
     Raises:
         ConfigurationError: the arm does not reach the scene of this station.

@@ -162,7 +162,7 @@ def _named(step: Step, earlier: Sequence[Step], steps: Mapping[str, Step]) -> It
 
 
 def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:
-    """Poses of an arm that a registration asks for although no step says how the arm held the camera."""
+    """Yield poses of an arm that a registration asks for although no step says how the arm held the camera."""
     if step.gives != "registrations":
         return
     wanted = WantedRegistrations.of(step.params)
@@ -191,7 +191,7 @@ def _too_fast(
 
 
 def _too_late(protocol: Protocol) -> Iterator[tuple[FieldPath, str]]:
-    """Waits before a step that moves the robot tries again, after which the confirmation would not hold any more."""
+    """Yield waits before a step that moves the robot tries again, after which the confirmation would have lapsed."""
     holds_s = protocol.motion.confirmed_for_s
     for index, step in enumerate(protocol.steps):
         if step.moves_robot and step.recovery.retries and step.recovery.wait_s >= holds_s:
@@ -203,7 +203,7 @@ def _too_late(protocol: Protocol) -> Iterator[tuple[FieldPath, str]]:
 
 
 def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:
-    """Stations that the protocol names but the rig file does not have."""
+    """Yield stations that the protocol names but the rig file does not have."""
 
     def walk(value: Plain, at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
         if isinstance(value, dict):

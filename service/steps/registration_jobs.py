@@ -161,7 +161,7 @@ class _Plan:
         return _MAPPERS.get(source) or next(iter(wanted), "incremental")
 
     def _model(self, mapper: str, size: str, shared: Mapping[str, Any]) -> _Model | None:
-        """Poses and tracks of structure from motion; None until they are computed."""
+        """Return poses and tracks of structure from motion; None until they are computed."""
         known = next((source for source in reversed(QUICK) if source in self.wanted.poses), None)
         prior = None
         if known is not None:
@@ -187,7 +187,7 @@ class _Plan:
         return _Model(refs[f"{mapper}.json"], refs[f"{mapper}_tracks.npz"])
 
     def _pieces(self, size: str, shared: Mapping[str, Any], prior: Reference | None) -> dict[str, Any] | None:
-        """Features and matches as arguments, with those computed while the images arrived; None until all exist."""
+        """Return features and matches as arguments, and those computed while images arrived; None until all exist."""
         effort = self.wanted.structure_from_motion
         common = {**_copied(shared, "camera"), "effort": effort.plain(), **_copied(shared, *_REDUCED)}
         images = read_part(_Images, shared).images
@@ -225,7 +225,7 @@ class _Plan:
         return {"features": features, "matches": [job.artefacts[0].sha256 for job in finished]}
 
     def _arguments(self, size: str) -> dict[str, Any]:
-        """Arguments of the search for outlines at a size; the other jobs share most of them."""
+        """Return the arguments of the search for outlines at a size; the other jobs share most of them."""
         arguments = dict(self.outlines.arguments)
         arguments.pop("model", None)  # present where the search itself needed poses from structure from motion
         if not size:
@@ -266,7 +266,7 @@ def _copied(arguments: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _pixels(size: str) -> tuple[int, int]:
-    """Width and height of 1920x1080."""
+    """Return width and height of 1920x1080."""
     width, _, height = size.partition("x")
     return int(width), int(height)
 

@@ -113,7 +113,7 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
 
 
 def denser_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
-    """Further viewpoints that a step may suggest: a grid of tilts and azimuths at the same distance.
+    """Return further viewpoints that a step may suggest: a grid of tilts and azimuths at the same distance.
 
     A viewpoint is named after its place, such as `v2_t25-40` for a tilt of 25° and an azimuth of −40°, so that names
     mean the same in every attempt.
@@ -139,7 +139,7 @@ def flange_target(T_base_camera: Transform, T_flange_camera: Transform) -> Trans
 
 
 def _spread(i: int, approach: Array, side: Array) -> Array:
-    """Low-discrepancy offset in the horizontal plane, within ±1 (R2 sequence, Roberts 2018)."""
+    """Return a low-discrepancy offset in the horizontal plane, within ±1 (R2 sequence, Roberts 2018)."""
     u = (0.5 + 0.7548776662466927 * (i + 1)) % 1.0
     v = (0.5 + 0.5698402909980532 * (i + 1)) % 1.0
     return (2 * u - 1) * side + (2 * v - 1) * approach

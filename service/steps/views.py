@@ -351,7 +351,7 @@ class _CaptureLoop:
         return environment
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
-        """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
+        """Let the controller solve a viewpoint; return its joints (N,). Raises UnreachablePoseError."""
         target, near = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), viewpoint.joints_rad
         return robot.solve_ik(target, robot.state().sample.joints_rad if near is None else near)
 

@@ -187,7 +187,7 @@ def _errors(registered: _Registered, measured: _ScanAndCtSpheres) -> _Errors:
 
 
 def _measured(arguments: job.Arguments) -> _ScanAndCtSpheres:
-    """Scan, control scan and CT, matched by their spheres."""
+    """Match scan, control scan and CT by their spheres."""
     scan = _spheres(arguments.scan)
     control = _control(scan, arguments.control_scan)
     if arguments.ct is None:

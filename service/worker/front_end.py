@@ -41,7 +41,7 @@ def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
 
 
 def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
-    """Geometrically verified matches of some pairs of images."""
+    """Match some pairs of images, and verify the matches geometrically."""
     arguments = context.arguments
     with _front_end(arguments) as front:
         found = front.match_pairs(read_features(context, arguments.features), arguments.pairs, context.progress)
@@ -53,7 +53,7 @@ def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
 
 
 def read_features(context: JobContext[Any], wanted: Mapping[str, Hash]) -> dict[str, ImageFeatures]:
-    """Features from their files, by image."""
+    """Read features from their files, by image."""
     return {name: ImageFeatures.from_bytes(context.input(sha256).read_bytes()) for name, sha256 in wanted.items()}
 
 

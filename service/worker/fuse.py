@@ -118,7 +118,7 @@ def _space(region: job.Region, T_scan_frame: Transform, up: Array) -> Box | Pris
 
 
 def _wound(fused: Fused, up: Array) -> tuple[Point, ...]:
-    """Corners of the wound's outline at its upper end; empty without a wound."""
+    """Return the corners of the wound's outline at its upper end; empty without a wound."""
     points = fused.surface.vertices_m[fused.wound]
     if len(points) < 3:
         return ()

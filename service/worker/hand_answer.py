@@ -160,7 +160,7 @@ class HandGuide:
         return measures
 
     def next_place(self) -> tuple[str, WantedView | None]:
-        """Directions to the next place, and the place; those for the first image if the pose was lost repeatedly."""
+        """Return directions to the next place, and the place; those for the first image after repeated loss."""
         T, level = self.new.T_scene_camera, self.new.T_scene_level
         if T is None or level is None:
             return (self.arguments.first_words if self._lost() >= _LOST_AFTER else AGAIN), None

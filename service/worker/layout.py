@@ -99,7 +99,7 @@ def _not_wider(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: float) -> CameraModel:
-    """Nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
+    """Return nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
 
     Raises:
         DataError: the file does not state its focal length.
@@ -206,5 +206,5 @@ def _draw_number(picture: NDArray[np.uint8], text: str, curve: Array, thick: int
 
 
 def _sixteenths(curve: Array) -> NDArray[np.int32]:
-    """Pixels as OpenCV expects them with four fractional bits."""
+    """Return pixels as OpenCV expects them, with four fractional bits."""
     return np.rint(curve * 16).astype(np.int32)

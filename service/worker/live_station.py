@@ -96,11 +96,11 @@ class LiveStation:
     targets_m: Array
 
     def error_m(self) -> float:
-        """Predicted error (1σ, 3D) at the worst target."""
+        """Predict the error (1σ, 3D) at the worst target."""
         return self._worst_m(pose_covariance([v.information for v in self.informations], self.P) + self.mounting)
 
     def outline_limited_m(self) -> float:
-        """Predicted error (1σ, 3D) at the worst target if the camera poses were exact."""
+        """Predict the error (1σ, 3D) at the worst target if the camera poses were exact."""
         return self._worst_m(pose_covariance([v.information for v in self.informations], np.zeros((6, 6))))
 
     def _worst_m(self, covariance: Array) -> float:

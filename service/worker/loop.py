@@ -93,7 +93,7 @@ def _disk_full(store: Store, *, told: bool) -> bool:
 
 
 def _following(store: Store) -> FollowedRuns:
-    """Imported at the first job, like the job's function."""
+    """Make the follower; its module is imported at the first job, like the job's function."""
     from service.worker.following import FollowedRuns  # noqa: PLC0415 - it imports all step kinds, which takes a second
 
     return FollowedRuns(store)

@@ -168,7 +168,7 @@ def work_side_by_side(
 
 
 def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int) -> None:
-    """Entry point of a child."""
+    """Run a child: its entry point."""
     show_own_words_only()
     os.setsid()  # Ctrl-C must reach only the worker, which ends its children and their processes
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()

@@ -187,7 +187,7 @@ def corrected_mounting(record: shared.ArmCorrection) -> CorrectedMounting:
 
 
 def _five_columns(dh_deltas: Array) -> Array:
-    """Deltas with those of β, which calibrations of before version 4 did not have."""
+    """Return deltas with those of β, which calibrations of before version 4 did not have."""
     if dh_deltas.ndim != 2 or dh_deltas.shape[1] != 4:
         return dh_deltas
     return np.concatenate([dh_deltas, np.zeros((len(dh_deltas), 1))], axis=1)

@@ -320,7 +320,7 @@ def _with_contradictions(
 
 
 def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> job.LeaveOneOut | None:
-    """Errors of each sphere predicted from the others; None if a station sees too few spheres for that."""
+    """Return the errors of each sphere predicted from the others; None if a station sees too few spheres for it."""
     try:
         left_out = leave_one_out(answer, refined=refined)
     except ComputeError:

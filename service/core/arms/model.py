@@ -152,7 +152,7 @@ def flange_pose(arm: ArmModel, joints_rad: Array) -> Transform:
 
 
 def pose_gap(T_a: Transform, T_b: Transform) -> tuple[float, float]:
-    """Distance (m) and angle (rad) between two poses (4, 4)."""
+    """Return the distance (m) and the angle (rad) between two poses (4, 4)."""
     turn = T_a[:3, :3].T @ T_b[:3, :3]
     w = (turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
     angle_rad = math.atan2(math.hypot(*w), float(np.trace(turn)) - 1.0)

@@ -85,7 +85,7 @@ def freed_utc(protocol: Protocol, state: RunState) -> str:
 
 
 def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
-    """Seconds from `freed_utc` to a result that arrives at `now_utc`; None if it is in time."""
+    """Return the seconds from `freed_utc` to a result that arrives at `now_utc`; None if it is in time."""
     freed = freed_utc(protocol, state)
     if not freed:
         return None

@@ -38,7 +38,7 @@ _AGREE_SHARE = 0.001  # and of the time that has passed: UTC is slewed by up to 
 
 
 def seconds_between(earlier_utc: str, later_utc: str) -> float:
-    """Seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
+    """Return the seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
     return max(0.0, (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds())
 
 

@@ -237,7 +237,7 @@ def run_aborted(protocol: Protocol, state: RunState, event: Event, p: RunAborted
 
 
 def worked_s(state: RunState, event: Event) -> float | None:
-    """Seconds that the work of the current step has taken; None if it did not begin."""
+    """Return the seconds that the work of the current step has taken; None if it did not begin."""
     return state.step.work_s(event.at_utc) if state.step.work_began_utc else None
 
 

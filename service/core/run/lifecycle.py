@@ -110,7 +110,7 @@ class Lifecycle:
         return tuple(trigger for source, trigger in self._targets if source == state)
 
     def place(self, state: str) -> MachineState | None:
-        """Step, phase and whether paused; None once the run has ended."""
+        """Return step, phase and whether paused; None once the run has ended."""
         return self._places.get(state)
 
 

@@ -205,7 +205,7 @@ class StepState:
     worked_s: float | None = None  # how long the last attempt worked until it had its figures or failed
 
     def work_s(self, now_utc: str) -> float:
-        """Seconds that the present attempt has worked until a time (ISO 8601), without those for which it waited."""
+        """Return the seconds that this attempt has worked until a time (ISO 8601), waiting excluded."""
         waits_s = seconds_between(self.waits_since_utc, now_utc) if self.waits_since_utc else 0.0
         return max(0.0, seconds_between(self.work_began_utc, now_utc) - self.waited_s - waits_s)
 

@@ -137,10 +137,10 @@ class _ShallowComposer(Composer):
             return super().compose_mapping_node(anchor)
 
     def descend_resolver(self, current_node: Any, current_index: Any) -> None:
-        """Nothing: tags have no meaning here."""
+        """Do nothing: tags have no meaning here."""
 
     def ascend_resolver(self) -> None:
-        """Nothing, likewise."""
+        """Do nothing, likewise."""
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> str:
         """Return no tag."""
@@ -256,7 +256,7 @@ def decoded(content: bytes, *, name: str, error: type[OrthocaptureError]) -> str
 def checked(
     data: Plain, model: type[ModelT], tree: YamlTree, at: FieldPath = ()
 ) -> tuple[ModelT | None, list[YamlProblem]]:
-    """Part of a file as an instance of `model`, or None and what is wrong with it.
+    """Read part of a file as an instance of `model`; return it, or None, and what is wrong with it.
 
     Types are strict, as in JSON: quoted text is not a number, and `yes` is not a boolean.
 

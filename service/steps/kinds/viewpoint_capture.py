@@ -164,7 +164,7 @@ class _Capture:
         return [viewpoint for viewpoint in self.viewpoints if viewpoint.name in taken]
 
     def candidates(self) -> list[tuple[Viewpoint, float]]:
-        """Further viewpoints of the last station that the arm can reach, with the travel time (s)."""
+        """Return further viewpoints of the last station that the arm can reach, with the travel time (s)."""
         taken = {viewpoint.name for viewpoint in self.viewpoints}
         return feasible_extra(self._context, [v for v in self._extra if v.name not in taken], self._nominal)
 
