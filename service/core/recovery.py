@@ -104,8 +104,8 @@ class WayOn:
     verb: OperatorVerb
     step: str  # the step concerned
     words: str
-    minutes: float | None  # how long it takes; None if not known in advance
-    loses: str  # what no longer counts afterwards, as a phrase
+    minutes: float | None  # the time that it takes; None if not known in advance
+    loses: str  # a phrase on what no longer counts afterwards
     available: bool = True
     why_not: str = ""
 

@@ -39,8 +39,8 @@ class CalibrationDetails(JobRecord):
     Attributes:
         views_without_board: images that were not used.
         partial_views: number of corners in each image of a part of the board; like `reasons` only with `known`.
-        reasons: why images were not used.
-        intrinsics: if they were solved.
+        reasons: the reasons why images were not used.
+        intrinsics: the intrinsics, if they were solved.
     """
 
     views_without_board: tuple[str, ...] = ()

@@ -20,7 +20,7 @@ class Region(JobRecord):
         by: the person who drew it.
         corners_m: (K, 3) corners of a polygon, in order; empty for a box.
         along: the direction from the surface towards the viewer of the polygon; None: away from the table.
-        below_m, above_m: how far the polygon reaches beyond its lowest and highest corner.
+        below_m, above_m: the polygon's reach beyond its lowest and highest corner.
         centre_m, size_m: centre and size of a box.
     """
 

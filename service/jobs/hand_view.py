@@ -88,7 +88,7 @@ class Answer(JobRecord):
     T_level_camera: Matrix | None = None
     places: tuple[PlaceStatus, ...] = ()
     cells: tuple[tuple[int, ...], ...] = ()  # number of board corners in each cell of the frame
-    spheres_m: tuple[Point, ...] = ()  # as the images up to this one locate them
+    spheres_m: tuple[Point, ...] = ()  # the spheres as the images up to this one locate them
     T_scene_cameras: dict[str, Matrix] = Field(
         default_factory=dict[str, Matrix]
     )  # of all images, refined by this one

@@ -46,7 +46,7 @@ class SearchedPhotograph(JobRecord):
 class LayoutDetails(JudgedLayout):
     """The judged layout, its photographs, and the moves that would resolve its near-symmetries."""
 
-    chi2: float | None = None  # of the adjustment of the photographs
+    chi2: float | None = None  # the χ² of the adjustment of the photographs
     photographs: tuple[SearchedPhotograph, ...] = ()
     moves: tuple[SphereMove, ...] = ()
 

@@ -42,7 +42,7 @@ class Grant(Record):
     job: str
     memory_mb: float
     waits: str = ""  # the reason, as a phrase; "" for one that has been granted
-    place: int = 0  # in the order in which those that wait came
+    place: int = 0  # the place in the queue of those that wait
 
     @property
     def lives(self) -> bool:

@@ -21,7 +21,7 @@ from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact
 
 T = TypeVar("T")
-_LASTING_S = 3.0  # how long the text must have stayed the same before they are shown
+_LASTING_S = 3.0  # how long the text must have stayed the same before it is shown
 
 
 def wait_for(

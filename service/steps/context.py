@@ -51,9 +51,9 @@ class StationLayout:
     robot: str  # device name in rig.yaml
     scene_centre_m: tuple[float, float, float]
     approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
-    obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # what else stands there, by name
+    obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # the other things that stand there, by name
     is_arm: bool = True  # not axes of another kind, whose motions are not planned
-    abandoned: Abandoned | None = None  # what becomes of a motion whose program died, if the driver's section says so
+    abandoned: Abandoned | None = None  # the end of a motion whose program died, if the driver's section says so
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class LeaveToMove:
     `not_before_monotonic_s` is a time of the host's monotonic clock before the confirmation was given.
     """
 
-    seq: int  # of its event
+    seq: int  # its event
     by: str
     not_before_monotonic_s: float
 
@@ -292,7 +292,7 @@ class StepContext:
     moment: Callable[[], Moment]  # now, in both clocks: for times that are stored and compared later
     # Surrounds each motion of an arm; raises StepInterruptedError if nobody has let it move for too long.
     motion: Callable[[], AbstractContextManager[None]]
-    wait_for_results: Callable[[float], None]  # as `wait`, where jobs are waited for
+    wait_for_results: Callable[[float], None]  # does the same as `wait`, where jobs are awaited
     busy: Callable[[str], None] = lambda _what: None  # call before a long call, with what it does
 
     @property

@@ -32,13 +32,13 @@ class Ring(Record):
     Azimuth 0 is the person's side at the first image, positive to the right. A range of 360° is a whole ring.
     """
 
-    tilt_deg: Annotated[float, Field(ge=0, le=60)]  # from the vertical
+    tilt_deg: Annotated[float, Field(ge=0, le=60)]  # the angle from the vertical
     azimuth_from_deg: float = -180.0  # start of the range
     azimuth_to_deg: float = 180.0  # end of the range
     count: Annotated[int, Field(ge=1, le=60)]  # places on the ring
-    distance_m: Annotated[float, Field(ge=0.2, le=2)]  # from the middle of the scene
+    distance_m: Annotated[float, Field(ge=0.2, le=2)]  # the distance from the middle of the scene
     aim_spread_m: Annotated[float, Field(ge=0, le=0.2)] = (
-        0.0  # of the aim point around the middle, for images of the board
+        0.0  # the aim point's distance from the middle, for images of the board
     )
 
     def azimuths_deg(self) -> list[float]:
@@ -58,8 +58,8 @@ class Params(StepParams):
     by_hand: ClassVar = True
     repeated: ClassVar = RepeatedStep("Take the images that are missing or would help; the others are kept")
 
-    purpose: Literal["dataset", "control", "calibration"]  # what the images are for
-    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # where images are to be taken from
+    purpose: Literal["dataset", "control", "calibration"]  # the purpose of the images
+    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # the places from which images are to be taken
     prefix: str = "h_"  # the beginning of the views' names
     min_images: Annotated[int, Field(ge=3)] = 12  # usable images that are needed at least
     max_images: Annotated[int, Field(ge=3)] = 200  # including unusable ones
@@ -67,8 +67,8 @@ class Params(StepParams):
     calibration: Annotated[str | None, NAMES_CALIBRATION] = None
     # Steps that locate the spheres, the best first: ct_import, layout_check.
     spheres_of: Annotated[tuple[str, ...], NAMES_SPHERES] = ()
-    sensor_width_mm: float = 35.7  # for images of the board, together with the focal length in the file
-    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
+    sensor_width_mm: float = 35.7  # the width for images of the board, together with the focal length in the file
+    coverage: CoverageRule = CoverageRule()  # rules by which a view counts for a point of the specimen's surface
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion
     pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # expected rotation error of structure from motion
     scan_sigma_mm: Annotated[float, Field(ge=0)] = 0.03  # expected error of the scan's own points, for predictions

@@ -91,7 +91,7 @@ class CoverageRule(Record):
     min_views: Annotated[int, Field(ge=1)] = 2  # views that must see the point
     # Angle between the viewing ray and the normal of the surface.
     max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 65.0
-    max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # from the camera
+    max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # the largest distance from the camera
 
 
 class LiveParams(Record):
@@ -106,7 +106,7 @@ class LiveParams(Record):
     # hand-eye calibration show it.
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
     arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # likewise, the scatter of the camera's rotations
-    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
+    coverage: CoverageRule = CoverageRule()  # rules by which a view counts for a point of the specimen's surface
     # At the end of the step, for jobs that have not finished: the longest wait without any of them finishing.
     wait_s: Annotated[float, Field(ge=0)] = 60.0
 

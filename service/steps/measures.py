@@ -60,7 +60,7 @@ class RegistrationMeasures(MeasureRecord, Generic[M]):
     In events and gates, the name of the registration stands before the name of the number: `colmap_rms_px`.
     """
 
-    registrations: Mapping[str, M] = Field(default_factory=dict)  # by name
+    registrations: Mapping[str, M] = Field(default_factory=dict)  # the registrations' measures, by name
 
     @classmethod
     def of_one(cls) -> type[MeasureRecord]:

@@ -34,7 +34,7 @@ _MAPPERS = {"colmap": "incremental", "glomap": "global", "triangulated": "triang
 class Task:
     """A job that a registration needs; `job` is None until it is enqueued."""
 
-    name: str  # of the job's key
+    name: str  # the name in the job's key
     request: JobRequest
     job: JobState | None
 

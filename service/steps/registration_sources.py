@@ -36,7 +36,7 @@ class WantedRegistrations(BaseModel):
         hand_eye: steps with the mount of the camera on its arm.
         reduced: sizes of reduced images, such as 1920x1080.
         reduced_poses: sources for the reduced images.
-        structure_from_motion: how many features and pairs.
+        structure_from_motion: the number of features and pairs, as a level.
     """
 
     model_config = ConfigDict(frozen=True)

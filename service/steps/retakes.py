@@ -15,8 +15,8 @@ from service.steps.notes import DEPARTING, SPOILT, images_to_repeat
 
 CLEAN: list[dict[str, str]] = [{"action": "clean_lens"}]  # for the simulated technician
 IN_A_ROW = 3  # consecutive spoilt images: beyond chance, so they have a common cause
-_MOST_STOPS = 2  # of one step; after that, only the gates judge the images
-_FACTOR = 1.6  # of the edge width in the sharpest image of the step
+_MOST_STOPS = 2  # the most stops of one step; after that, only the gates judge the images
+_FACTOR = 1.6  # the factor of the edge width in the sharpest image of the step
 _WIDEST_PX, _WIDEST_SHARE = 7.0, 0.002  # the largest limit on an edge width, in px and as a share of the image width
 _MOST_NAMES = 6
 

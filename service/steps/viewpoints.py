@@ -24,7 +24,7 @@ class Arc(Record):
     Azimuth 0 looks from the robot's side; tilt 0 looks straight down.
     """
 
-    tilt_deg: float  # from the vertical, 0 to 80
+    tilt_deg: float  # the angle from the vertical, 0 to 80
     azimuth_from_deg: float  # start of the range, from the robot's side
     azimuth_to_deg: float  # end of the range
     count: int  # viewpoints on the arc
@@ -41,14 +41,14 @@ class ViewpointSet(Record):
     """Arcs at one station, and how the camera is rolled and aimed."""
 
     station: str  # name in the rig file
-    prefix: str  # of the viewpoints' names
-    arcs: tuple[Arc, ...]  # where the viewpoints lie
+    prefix: str  # the beginning of the viewpoints' names
+    arcs: tuple[Arc, ...]  # the arcs on which the viewpoints lie
     rolls_deg: tuple[float, ...] = (0.0,)  # rolls of the camera, cycled over the viewpoints
     # Where the top of the image points: away from the base, natural for an arm's wrist, or upwards, as it does for a
     # camera beside a turntable.
     image_top: Literal["away", "up"] = "away"
     aim_spread_m: float = 0.0  # spread of the aim point around the scene centre (for board images)
-    aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the aim point, in the base frame
+    aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the aim point's offset, in the base frame
 
     @property
     def count(self) -> int:

@@ -114,9 +114,9 @@ Exposure = Annotated[
 class Spheres(Record):
     """The reference spheres on and around the specimen."""
 
-    radius_mm: Positive  # of each sphere
-    registration: Annotated[int, Field(ge=4)]  # how many
-    control: Annotated[int, Field(ge=0)] = 0  # how many control spheres; they take no part in the registration
+    radius_mm: Positive  # the radius of each sphere
+    registration: Annotated[int, Field(ge=4)]  # the number of registration spheres
+    control: Annotated[int, Field(ge=0)] = 0  # the number of control spheres; they take no part in the registration
     # If it is not given, the detector learns it from the clearest spheres of each image.
     colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
 
@@ -139,15 +139,15 @@ class CameraSection(Record):
     aperture_f: Positive  # f-number
     exposure_s: Exposure  # seconds, or a fraction such as 1/15
     iso: Annotated[int, Field(gt=0)]  # sensitivity
-    focus_mode: Text = "Manual"  # as the camera names it
-    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"  # what the camera writes
+    focus_mode: Text = "Manual"  # the camera's name for it
+    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"  # the files that the camera writes
 
 
 class Motion(Record):
     """How the arm moves between viewpoints."""
 
-    speed_rad_s: Positive = 0.5  # of the fastest joint
-    acceleration_rad_s2: Positive = 0.5  # of the fastest joint
+    speed_rad_s: Positive = 0.5  # the speed of the fastest joint
+    acceleration_rad_s2: Positive = 0.5  # the acceleration of the fastest joint
     dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # between standing still and the exposure
     # How long a confirmation lets the arm set out without visible progress; then it is asked for again.
     confirmed_for_s: Positive = 60.0
@@ -174,7 +174,7 @@ class Gate(Record):
     measure: Text  # name of a number that the step measures
     min: Finite | None = None  # smallest value that passes
     max: Finite | None = None  # largest value that passes
-    unit: str = ""  # of the limits; checked against the unit of the measure
+    unit: str = ""  # the unit of the limits; checked against the unit of the measure
     why: str = ""  # the reason for the limit, for people
     unless_skipped: str | None = None  # the earlier step that the number needs: if it is skipped, there is no gate
     accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates.acceptance
@@ -192,33 +192,33 @@ class Recovery(Record):
 class HandAction(Record):
     """The technician's work by hand when confirming this step; a simulated rig does it by itself."""
 
-    action: Text  # what the simulator is asked to do
+    action: Text  # the action that the simulator is asked for
     station: str | None = None  # where
-    device: str | None = None  # with which device of the rig
+    device: str | None = None  # the rig's device that is used
 
 
 class StepFields(Record):
     """The fields of a step other than its params."""
 
     id: StepId  # name in the record, unique in the protocol
-    kind: Text  # what the step does: one of the step kinds
-    title: Text  # what people read
+    kind: Text  # the work of the step: one of the step kinds
+    title: Text  # the title that people read
     why: str = ""  # the reason, for the technician
-    instructions: str = ""  # what the technician should do
+    instructions: str = ""  # the technician's work, as text
     # In service/web/run/drawings, shown beside the instructions; "": that of the step kind. A checklist with `camera`
     # offers the live view, because the lens is focused there.
     drawing: str = ""
     checklist: tuple[Text, ...] = ()  # items to tick before the step can be confirmed
     gates: tuple[Gate, ...] = ()  # measured numbers with their limits
-    sign: bool = False  # whether a person signs before the step passes
-    confirm: bool = True  # whether a person starts it; a step that moves the robot always waits for one
-    skippable: bool = False  # whether a person may skip it, with a reason
-    irreversible: bool = False  # whether nothing before it can be done again afterwards
-    cannot_be_undone: str = ""  # what a person reads before an irreversible step: a sentence
+    sign: bool = False  # true if a person signs before the step passes
+    confirm: bool = True  # true if a person starts it; a step that moves the robot always waits for one
+    skippable: bool = False  # true if a person may skip it, with a reason
+    irreversible: bool = False  # true if nothing before it can be done again afterwards
+    cannot_be_undone: str = ""  # the sentence that a person reads before an irreversible step
     requires: tuple[str, ...] = ()  # earlier steps that must not have been skipped
     # How long the work usually takes, in seconds; used until this site has measured it. None: not known.
     takes_s: Positive | None = None
-    recovery: Recovery = Recovery()  # what happens when the work fails
+    recovery: Recovery = Recovery()  # the response to failed work
     simulated_hands: tuple[HandAction, ...] = ()  # ignored on a real rig
 
 
@@ -274,17 +274,17 @@ class ProtocolFields(Record):
 
     id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]  # name in the record and on the pages
     version: Text  # changes with the content
-    title: Text  # what people read
-    source: str = ""  # where the procedure comes from
+    title: Text  # the title that people read
+    source: str = ""  # the source of the procedure
     spheres: Spheres  # radius and number of the spheres
     board: CalibrationBoard | None = None  # the calibration board; needed by a step that calibrates
     camera: CameraSection | None = None  # None: no settings are required, and no step sets a camera
     motion: Motion = Motion()  # speed and acceleration of the arm
-    settle: Settle = Settle()  # when the arm counts as standing still
+    settle: Settle = Settle()  # the conditions on which the arm counts as standing still
     # Whether a person who took no part in the run must release it before anything is exported.
     release: Literal["none", "second_person"] = "none"
     reasons: Reasons = Reasons()  # presets for the reason of a redo, a skip or an acceptance
-    data_set: DataSetStatement = DataSetStatement()  # what an exported data set says about itself
+    data_set: DataSetStatement = DataSetStatement()  # the statement of an exported data set about itself
 
 
 class Protocol(ProtocolFields):

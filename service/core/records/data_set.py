@@ -176,8 +176,8 @@ def licence_name(address: str) -> str:
 
 
 FIRST_VERSION = "1.0.0"
-VERSION = r"^\d{1,6}\.\d{1,6}\.\d{1,6}$"  # of a data set: MAJOR.MINOR.PATCH
-LONGEST_NAME = 200  # of a creator, characters
+VERSION = r"^\d{1,6}\.\d{1,6}\.\d{1,6}$"  # a data set's version: MAJOR.MINOR.PATCH
+LONGEST_NAME = 200  # the longest name of a creator, characters
 _Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME)]
 _Line = Annotated[str, Field(max_length=1000)]
 
@@ -185,13 +185,13 @@ _Line = Annotated[str, Field(max_length=1000)]
 class DataSetStatement(Record):
     """An exported data set's statement about itself; what is left out is reported as not given."""
 
-    title: _Line = ""  # of the data set; without it, the protocol's title and the specimen
+    title: _Line = ""  # the data set's title; without it, the protocol's title and the specimen
     licence: _Line = ""  # SPDX identifier such as CC-BY-4.0, or the licence's address
     ethics: _Line = ""  # approval or waiver, with its number and the body that gave it
     # People, each with an ORCID if possible, or bodies, with a ROR: "Rivera, Ana 0000-0002-1825-0097".
     creators: tuple[_Name, ...] = ()
-    cite: _Line = ""  # how the data set should be cited
-    doi: _Line = ""  # of this data set, such as 10.5281/zenodo.1234567
+    cite: _Line = ""  # the way to cite the data set
+    doi: _Line = ""  # this data set's DOI, such as 10.5281/zenodo.1234567
     publisher: _Line = ""  # the body that publishes it, with its ROR if possible
     funders: tuple[_Name, ...] = ()  # bodies that paid for it, each with its ROR if possible
 

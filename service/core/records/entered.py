@@ -28,7 +28,7 @@ class RunAbout(Record):
     specimen: _Line = ""
     purpose: _Line = ""
     site: _Line = ""
-    operator: _Line = ""  # who works at the rig; the account that began the run is in its first event
+    operator: _Line = ""  # the person at the rig; the account that started the run is in its first event
     text: _Text = ""
 
 

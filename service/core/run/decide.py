@@ -59,7 +59,7 @@ class AskOperator:
     text: str
     checklist: tuple[str, ...]  # to be ticked with the confirmation
     options: tuple[OperatorVerb, ...]
-    sign_sha256: str = ""  # what a signature binds (OperatorAction.signed_sha256)
+    sign_sha256: str = ""  # the hash that a signature binds (OperatorAction.signed_sha256)
     ways: tuple[WayOn, ...] = ()  # the choices when the step is stopped, the recommended one first
 
 

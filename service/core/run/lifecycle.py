@@ -186,7 +186,7 @@ def _compile(steps: tuple[str, ...]) -> Lifecycle:
         for step in steps
         for phase in PHASES
     }
-    outgoing: dict[str, list[tuple[str, str]]] = {}  # of a state or an enclosing state: (trigger, target)
+    outgoing: dict[str, list[tuple[str, str]]] = {}  # by a state or an enclosing state: (trigger, target)
     for trigger, event in state_machine(steps).events.items():
         for source, transitions in event.transitions.items():
             outgoing.setdefault(source, []).append((trigger, str(transitions[0].dest)))

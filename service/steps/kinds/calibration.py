@@ -41,7 +41,7 @@ class Params(MovingParams):
     gives: ClassVar = "calibration"
     repeated: ClassVar = RepeatedStep("Take the board images that are missing and compute again; the others are kept")
 
-    solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
+    solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # the calibrations to compute
     board_poses: BoardPoses | None = None  # images whose poses the software plans
     viewpoints: tuple[ViewpointSet, ...] = ()  # or images from these viewpoints
     # Use the images of this earlier calibration step instead of new ones.

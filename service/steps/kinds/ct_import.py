@@ -27,7 +27,7 @@ class Params(StepParams):
 
     # mesh: segmented by other software (Mimics STL); segmentation: a series, and a DICOM SEG or NIfTI file of it
     source: Literal["dicom", "mesh", "segmentation"] = "dicom"
-    segments: tuple[str, ...] = ()  # of the segmentation: labels, in NIfTI files numbers; empty: all
+    segments: tuple[str, ...] = ()  # the segmentation's labels, in NIfTI files numbers; empty: all
     threshold_hu: float = -450.0  # half way between air and tissue or plastic: unbiased surfaces
     spheres: int  # number of registration and control spheres in the volume
     wait_s: float = 600.0  # longest wait until the series is complete

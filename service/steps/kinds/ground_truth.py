@@ -66,14 +66,14 @@ _Mm = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class WoundRegion(Record):
     """A part of space whose source a person chooses, against the proposal: an extruded polygon or a box."""
 
-    source: Literal["ct", "scan"] = "ct"  # what counts there
-    frame: fuse.Frame = "world"  # of the positions; world: the base of the first station
-    corners_mm: tuple[Point, ...] = ()  # of a polygon, in order: x, y, z
-    along: Point | None = None  # from the polygon to its viewer; None: away from the table
-    below_mm: float = 40.0  # how far the polygon reaches below its lowest corner
-    above_mm: float = 5.0  # how far it reaches above its highest corner
-    centre_mm: Point | None = None  # of a box along the axes of the frame
-    size_mm: Point | None = None  # of the box
+    source: Literal["ct", "scan"] = "ct"  # the source that counts there
+    frame: fuse.Frame = "world"  # the frame of the positions; world: the base of the first station
+    corners_mm: tuple[Point, ...] = ()  # the corners of a polygon, in order: x, y, z
+    along: Point | None = None  # the direction from the polygon to its viewer; None: away from the table
+    below_mm: float = 40.0  # the polygon's reach below its lowest corner
+    above_mm: float = 5.0  # the polygon's reach above its highest corner
+    centre_mm: Point | None = None  # the centre of a box along the axes of the frame
+    size_mm: Point | None = None  # the size of the box
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
@@ -94,7 +94,7 @@ class Params(StepParams):
     # Step whose camera poses place both meshes; None: by the spheres alone.
     registration: Annotated[str | None, NAMES_REGISTRATION] = None
     blend_mm: _Mm = 3.0  # width of the overlap over which the mesh changes from the CT to the scan
-    chamfer_spacing_mm: _Mm = 0.1  # of the samples for the Chamfer distance
+    chamfer_spacing_mm: _Mm = 0.1  # the spacing of the samples for the Chamfer distance
     cut_posts_mm: _Mm | None = None  # cuts out spheres, and posts of this radius below them; None: they stay
     wound: tuple[WoundRegion, ...] = ()  # corrections of the proposed wound; a later one overrules an earlier one
 

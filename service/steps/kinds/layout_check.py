@@ -42,7 +42,7 @@ class Params(StepParams):
     gives: ClassVar = "rough_spheres"
     repeated: ClassVar = RepeatedStep("Move the spheres as it says, then take another photograph")
 
-    photographs: int = 1  # in the first attempt; the camera is moved in between
+    photographs: int = 1  # the photographs in the first attempt; the camera is moved in between
     most_photographs: int = 5  # most of one layout, while the measures are not certain enough for a decision
     between_s: float = 5.0  # time for moving the camera
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for a photograph that arrives as a file

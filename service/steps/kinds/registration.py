@@ -70,7 +70,7 @@ class Params(StepParams):
     # poses need no mount (spheres, colmap, glomap).
     hand_eye: Annotated[str | tuple[str, ...] | None, NAMES_CALIBRATION] = None
     scan: Annotated[str, NAMES_SCAN]  # step that imported the scan
-    poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
+    poses: tuple[Source, ...] = DEFAULT_SOURCES  # the sources of the camera poses; each gives a registration
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
     # The others search every image whole: "paper" is the published method without its networks, "grounded" has
     # Grounding DINO and SAM 2, and in "vote" it and the classical one must agree.

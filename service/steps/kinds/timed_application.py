@@ -23,7 +23,7 @@ class Params(StepParams):
     )
     needs_disk: ClassVar = False
 
-    product: str  # what is applied
+    product: str  # the product that is applied
     sublimates_after_s: float  # time until it has disappeared
     scan_within_s: float  # latest time of the scan after the application
     settle_s: float = 0.0  # waiting time before the next step

@@ -25,10 +25,10 @@ class Params(MovingParams):
 
     repeated: ClassVar = RepeatedStep("Take the views that are missing or would help; the others are kept")
 
-    purpose: Literal["dataset", "control"]  # what the images are for
-    viewpoints: tuple[ViewpointSet, ...]  # where the images are taken from
-    order: Order = "as_listed"  # of the viewpoints: as listed, or along the shortest way
-    live: LiveParams | None = None  # what is computed from each image during the capture; nothing if left out
+    purpose: Literal["dataset", "control"]  # the purpose of the images
+    viewpoints: tuple[ViewpointSet, ...]  # the viewpoints from which the images are taken
+    order: Order = "as_listed"  # the order of the viewpoints: as listed, or along the shortest way
+    live: LiveParams | None = None  # the numbers computed from each image during the capture; nothing if left out
 
     @property
     def needed_devices(self) -> tuple[NeededDevice, ...]:

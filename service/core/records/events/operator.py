@@ -20,9 +20,9 @@ class OperatorAction(Record):
     viewpoint: str | None = None  # redo of a single viewpoint
     reason: str = ""
     checklist: tuple[str, ...] = ()  # items ticked
-    meaning: str = ""  # of a signature
+    meaning: str = ""  # the meaning of a signature
     signed_sha256: str = ""  # hash of the event that was signed
-    role: str = ""  # of the person, where the action demands one
+    role: str = ""  # the person's role, where the action demands one
     identified: Identified = ""
     via: Literal["cli", "web", "pedal", "auto"] = "cli"
     automatic: bool = False
@@ -52,7 +52,7 @@ class RobotSeen(Record):
 
     kind: Literal["robot_seen"] = "robot_seen"
     device: str  # name in rig.yaml
-    lost_seq: int = 0  # of the event that reported the loss; 0: the program had ended, which no event had reported
+    lost_seq: int = 0  # the event that reported the loss; 0: the program had ended, which no event had reported
 
 
 class ControlTaken(Record):
@@ -94,8 +94,8 @@ class RunReleased(Record):
 
     kind: Literal["run_released"] = "run_released"
     meaning: str
-    signed_sha256: str  # of the run_completed event
-    identified: Literal["", "claimed", "password"] = ""  # how the person was identified; "" in older records
+    signed_sha256: str  # the hash of the run_completed event
+    identified: Literal["", "claimed", "password"] = ""  # the way of identification; "" in older records
 
 
 class EvidenceExported(Record):
@@ -106,4 +106,4 @@ class EvidenceExported(Record):
     file_name: str
     sha256: str
     size_bytes: int
-    head_sha256: str  # of the chain when it was made
+    head_sha256: str  # the chain's hash when it was made
