@@ -66,7 +66,7 @@ class PayloadSection(Record):
 class CollisionSection(Record):
     """Obstacles for the planner; the defaults suit a UR10e with a full-frame camera over a board on a table."""
 
-    arm: str | None = None  # arm model, such as UR10e; None: as the controller states it
+    arm: str | None = None  # arm model, such as UR10e; None: as the controller gives it
     table_below_scene_m: float = 0.07  # distance of the table's top below the scene's centre
     specimen_size_m: Vector3 = (
         0.34,

@@ -134,7 +134,7 @@ def results_to_come(log: RunRecord) -> list[PendingResult]:
 
 @dataclass(frozen=True, slots=True)
 class OpenJob:
-    """A job of a run that waits or is computed: its name, step and words, and how it stands."""
+    """A job of a run that waits or is computed: its name, step and label, and its state."""
 
     job: str
     step: str

@@ -66,7 +66,7 @@ def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[flo
 
 
 def _time(stated: str) -> tuple[datetime, float] | None:
-    """Return the time that a photograph states, and its resolution in seconds."""
+    """Parse the time in a photograph's EXIF; return it and its resolution in seconds."""
     for form in _FORMS:
         try:
             found = datetime.strptime(stated, form)  # noqa: DTZ007 - compared only with one that has no zone either
@@ -127,7 +127,7 @@ class ClockReading:
 
     @property
     def difference(self) -> str:
-        """The offset in words, such as `1.250 s behind`; "–" if it is not known."""
+        """The offset as text, such as `1.250 s behind`; "–" if it is not known."""
         if self.offset_s is None:
             return "–"
         return f"{abs(self.offset_s):.3f} s {'ahead' if self.offset_s > 0 else 'behind'}"
@@ -158,7 +158,7 @@ class ClockReading:
 
 
 def clock_offset_words(offset_s: float | None, clock: Literal["utc", "uptime"]) -> str:
-    """Return the clock offset in words that a device reported when it was opened."""
+    """Return as text the clock offset that a device reported when it was opened."""
     if clock == "uptime":
         return "counts from when it was switched on: only its drift matters"
     if offset_s is None:

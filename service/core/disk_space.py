@@ -46,7 +46,7 @@ class Forecast:
 
     @property
     def stop_below_bytes(self) -> int:
-        """Free space below which no further photograph is begun."""
+        """Free space below which no further photograph is started."""
         return LEAST_FREE_BYTES + _VIEWS_UNDER_WAY * self.view_bytes
 
     @property
@@ -128,5 +128,5 @@ def views_left(protocol: Protocol, state: RunState | None) -> int:
 
 
 def size_words(size_bytes: float) -> str:
-    """Return a size in words, such as `850 MB` or `12.3 GB`."""
+    """Return a size as text, such as `850 MB` or `12.3 GB`."""
     return f"{gigabytes(size_bytes):.1f} GB" if size_bytes >= 1e9 else f"{megabytes(size_bytes):.0f} MB"

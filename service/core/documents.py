@@ -78,7 +78,7 @@ def run_diagram(steps: Iterable[Step]) -> list[str]:
     for trigger, source, target in transition_table(tuple(known)):
         origin, end = source.split(SEPARATOR)[0], target.split(SEPARATOR)[0]
         if trigger.startswith("redo_") or origin == end:
-            continue  # redo arrows from every step would hide the rest; the page says it in words
+            continue  # redo arrows from every step would hide the rest; the page says it in a sentence
         if origin in known and end in known:
             inside[f"        {origin} --> {end}: {trigger}"] = None
         elif not (origin == PAUSED and end == COMPLETED):

@@ -15,7 +15,7 @@ class OrthocaptureError(Exception):
     Args:
         what: the fault in one sentence without a full stop.
         where: the file, line, field, device or record concerned.
-        remedy: what the reader should do about it.
+        remedy: the advice to the reader.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:

@@ -32,7 +32,7 @@ _SPARE = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 
 
 def damaged_jpegs(files: Sequence[Path]) -> dict[Path, str]:
-    """Return the damaged ones of complete JPEG files, with the decoder's words.
+    """Return the damaged ones of complete JPEG files, with the decoder's messages.
 
     Files of other kinds are passed over. A file with which the decoder ends, or does not end, is a damaged one too.
     """

@@ -16,7 +16,7 @@ Plain = Mapping[str, object]
 
 @dataclass(frozen=True, slots=True)
 class RecordedIdentity:
-    """The device that answered when it was opened (drivers.interfaces.DeviceIdentity); "" where it was not stated."""
+    """The device that answered when it was opened (drivers.interfaces.DeviceIdentity); "" where it was not given."""
 
     kind: str = ""  # robot, camera, scanner, ct, lightbox
     model: str = ""
@@ -46,7 +46,7 @@ class RecordedReport:
 
 @dataclass(frozen=True, slots=True)
 class RecordedOptics:
-    """Camera, lens and settings that a photograph states (the field `camera` of a View); "" or None: not stated."""
+    """Camera, lens and settings in a photograph's EXIF (the field `camera` of a View); "" or None: not given."""
 
     model: str = ""
     body_serial: str = ""
@@ -114,9 +114,9 @@ class CameraBodies:
     """The serial numbers of a run's cameras.
 
     Attributes:
-        wires: serial number that a camera states over its connection → device name in rig.yaml. Over USB a camera may
+        wires: serial number that a camera sends over its connection → device name in rig.yaml. Over USB a camera may
             put digits of its model before those of the body.
-        stated: the distinct serial numbers that the photographs state.
+        stated: the distinct serial numbers in the photographs.
     """
 
     wires: Mapping[str, str]
@@ -131,7 +131,7 @@ class CameraBodies:
 
     @property
     def explained(self) -> tuple[str, ...]:
-        """One sentence for each camera that is shown under another number than it states over its connection."""
+        """One sentence for each camera that is shown under another number than it reports over its connection."""
         return tuple(
             f"The serial number of {device} is {self._own(wire)}, as every photograph of it states. Over its "
             f"connection it states {wire}, which ends with the same digits: it is one and the same body"
@@ -165,7 +165,7 @@ def bodies_of(identities: Iterable[tuple[str, RecordedIdentity]], stated: Iterab
 
     Args:
         identities: (name in rig.yaml, identity in its DeviceReport) of each opened device.
-        stated: serial numbers in the photographs; "" is ignored.
+        stated: the serial numbers in the photographs; "" is ignored.
     """
     wires = {identity.serial: name for name, identity in identities if identity.kind == "camera"}
     return CameraBodies(wires, tuple(dict.fromkeys(number for number in stated if number)))

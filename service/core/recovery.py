@@ -1,4 +1,4 @@
-"""What can be done about a failed step: the policy, the operator's choices with their time and loss, and words."""
+"""What can be done about a failed step: the policy, the operator's choices with their time, loss and text."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
 
 
 def takes_words(minutes: float | None) -> str:
-    """Return a duration in words, such as `about 12 min`."""
+    """Return a duration as text, such as `about 12 min`."""
     if minutes is None:
         return "not known"
     if minutes == 0:

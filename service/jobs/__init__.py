@@ -1,4 +1,4 @@
-"""Kinds of jobs, declared once for steps, worker, audit and web; the list of all kinds, and their words."""
+"""Kinds of jobs, declared once for steps, worker, audit and web; the list of all kinds, and their labels."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class BoardSeen(JobRecord):
         pattern: printed on it.
         columns, rows: of inner corners.
         square_mm: edge of a square.
-        flatness_mm: largest bow that was stated.
+        flatness_mm: the largest bow that was given.
         bow_mm: how far its middle lies behind its sides, and behind its ends; None if it was taken as flat.
         bow_sigma_mm: standard deviations of the two.
     """

@@ -10,8 +10,8 @@ class SfmEffort(JobRecord):
     """How much effort structure from motion makes; SfmOptions has further fields, and the same defaults.
 
     Attributes:
-        max_image_size: features are searched in images reduced to this longer side, px.
-        max_features: per image.
+        max_image_size: the longer side, px, of the reduced images in which features are searched.
+        max_features: the most features of one image.
         neighbours: number of images that each image is matched with.
     """
 

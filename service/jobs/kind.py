@@ -47,7 +47,7 @@ class Demand:
 
 
 def usual_demand(_arguments: JobRecord) -> Demand:
-    """Return the demand of a kind that states none, such as one of a plug-in."""
+    """Return the demand of a kind that declares none, such as one of a plug-in."""
     return Demand(memory_mb=1000, limit_s=7200)
 
 

@@ -128,7 +128,7 @@ class MemoryGrants:
                 part = own.with_suffix(".part")
                 part.write_text(grant.model_dump_json(), encoding="utf-8")
                 part.replace(own)
-        except OSError as error:  # a disk that is full must not keep a job from being computed
+        except OSError as error:  # a disk that is full must not prevent a job from being computed
             _log.warning("the memory of jobs on this machine cannot be written down: %s", error)
             return wanted.model_copy(update={"waits": ""})
         return grant

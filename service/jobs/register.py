@@ -37,7 +37,7 @@ class LeaveOneOut(JobRecord):
 
 
 class Contradiction(JobRecord):
-    """A contradiction between the inputs, in words, and what to do; `refuses`: before the result is used."""
+    """A contradiction between the inputs, as text, and what to do; `refuses`: before the result is used."""
 
     kind: str
     what: str
@@ -129,7 +129,7 @@ KIND = JobKind(
     answer=Registration,
     compute="service.worker.register:register",
     words="registration",
-    version=4,  # states that light displaces single spheres
+    version=4,  # reports that light displaces single spheres
     order=61,
     demand=lambda arguments: Demand(memory_mb=500 + len(arguments.images), limit_s=3600 + 20 * len(arguments.images)),
 )

@@ -15,7 +15,7 @@ class Arguments(ImagesCamera):
     Attributes:
         images: the images of the captures.
         mappers: the mappers, each of which makes one model.
-        effort: the number of features and pairs, as a level.
+        effort: the limits on image size, features and pairs.
         prior: T_scan_camera by viewpoint, of an earlier registration; decides which pairs are matched.
         features: the files of features by viewpoint; None in old runs, in which one job did everything.
         matches: the files of matches.

@@ -62,7 +62,7 @@ class Runner:
     """Drives one run to its end, by the store's clock.
 
     `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures;
-    `held_up` begins to measure how long the machine keeps this program from running.
+    `held_up` begins to measure how long the machine prevents this program from running.
     """
 
     store: Store

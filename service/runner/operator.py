@@ -41,7 +41,7 @@ class Operator(Interface):
         ...
 
     def busy(self, what: str) -> None:
-        """Say in words what a long call is about to do; screens show it until the next `attend`."""
+        """Say what a long call is about to do; screens show it until the next `attend`."""
         ...
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:

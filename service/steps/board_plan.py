@@ -110,7 +110,7 @@ class Planner:
 
 
 def preview_board(planner: Planner, known: BoardKnowledge) -> PlannedBoard:
-    """Return all poses as they would be planned if camera, mount and board were as stated, before anything has moved.
+    """Return all poses as they would be planned if camera, mount and board were as given, before anything has moved.
 
     After the first pose, the place of the board counts as measured.
     """

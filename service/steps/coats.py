@@ -52,7 +52,7 @@ class Coat:
 
     @property
     def title(self) -> str:
-        """The time left in a few words."""
+        """The time left as a short text."""
         left_s = self.left_s
         if left_s is None:
             return f"Coat of {self.product}: how old it is cannot be known."

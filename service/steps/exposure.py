@@ -45,7 +45,7 @@ class FurtherImage:
 
 
 def settings_of(camera: FurtherCamera, wanted: CameraSettings) -> CameraSettings:
-    """Return the settings of a further camera: those of the protocol, except what its section in rig.yaml states."""
+    """Return the settings of a further camera: those of the protocol, except what its section in rig.yaml gives."""
     section = camera.section
     return replace(
         wanted,

@@ -34,7 +34,7 @@ from service.steps.viewpoints import plan_viewpoints
 
 @dataclass(frozen=True, slots=True)
 class BoardPreview:
-    """The board images of a calibration as they will be planned if board, mount and lens are as stated."""
+    """The board images of a calibration as they will be planned if board, mount and lens are as described."""
 
     T_base_camera: Array  # (K, 4, 4)
     prediction: BoardPrediction
@@ -46,7 +46,7 @@ def preview_board_poses(
 ) -> BoardPreview | None:
     """Preview the board poses of a step; None if the software does not plan them.
 
-    Raises ConfigurationError if protocol or rig file lack what a plan needs, or the scene is out of reach.
+    Raises ConfigurationError if protocol or rig file do not have what a plan needs, or the scene is out of reach.
     """
     if not isinstance(step.params, calibration.Params) or step.params.board_poses is None or protocol.board is None:
         return None

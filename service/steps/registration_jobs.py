@@ -272,7 +272,7 @@ def _pixels(size: str) -> tuple[int, int]:
 
 
 def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) -> RegistrationJobs | None:
-    """Return the jobs of a step's registrations according to the record; None for a step that has not begun them.
+    """Return the jobs of a step's registrations according to the record; None for a step that has not started them.
 
     Also None in runs of old versions, in which a registration waited for all of its sources.
     """

@@ -36,7 +36,7 @@ class WantedRegistrations(BaseModel):
         hand_eye: steps with the mount of the camera on its arm.
         reduced: sizes of reduced images, such as 1920x1080.
         reduced_poses: sources for the reduced images.
-        structure_from_motion: the number of features and pairs, as a level.
+        structure_from_motion: the limits on image size, features and pairs.
     """
 
     model_config = ConfigDict(frozen=True)

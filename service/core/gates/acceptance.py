@@ -1,4 +1,4 @@
-"""Accepting a measure outside its limits: who may, who may not, the words for it, and which steps depend on it."""
+"""Accepting a measure outside its limits: who may, who may not, the text for it, and which steps depend on it."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
 
 
 def late_words(protocol: Protocol, state: RunState, seconds: float) -> str:
-    """Return a delay in words, such as `arrived 12 min after the specimen was freed`."""
+    """Return a delay as text, such as `arrived 12 min after the specimen was freed`."""
     since = "the specimen was freed" if _freed_by_step_utc(protocol, state) else "the end of the run"
     minutes = round(seconds / 60)
     return f"arrived {minutes} min after {since}" if minutes else f"arrived after {since}"

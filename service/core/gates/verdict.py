@@ -126,7 +126,7 @@ def _places(apart: float) -> int:
 
 
 def limits(minimum: float | None, maximum: float | None) -> str:
-    """Return limits in words: `≥ 0.2 and ≤ 1`, or `exactly 0`; None means no limit on that side."""
+    """Return limits as text: `≥ 0.2 and ≤ 1`, or `exactly 0`; None means no limit on that side."""
     if minimum is not None and minimum == maximum:
         return f"exactly {minimum:g}"
     low = "" if minimum is None else f"≥ {minimum:g}"

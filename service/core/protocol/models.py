@@ -68,7 +68,7 @@ class Reasons(Record):
 
 
 def full_reason(preset: str, own: str) -> str:
-    """Return the reason that is recorded: the chosen preset, then the operator's own words."""
+    """Return the reason that is recorded: the chosen preset, then the operator's own text."""
     return ": ".join(part for part in (preset.strip(), own.strip()) if part)
 
 
@@ -127,9 +127,9 @@ class CalibrationBoard(Record):
     columns: Annotated[int, Field(ge=3)]  # inner corners in a row
     rows: Annotated[int, Field(ge=3)]  # inner corners in a column
     square_mm: Positive  # side of a square
-    # Largest bow of the board, as the maker states it; 0: exactly flat; default: 0.2.
+    # Largest bow of the board, as the maker gives it; 0: exactly flat; default: 0.2.
     flatness_mm: Annotated[float, Field(ge=0, le=5)] | None = None
-    # Largest error of the square's side, in percent of it, as the maker states it; default: 0.05 (0.1 mm in 200 mm).
+    # Largest error of the square's side, in percent of it, as the maker gives it; default: 0.05 (0.1 mm in 200 mm).
     size_tolerance_percent: Annotated[float, Field(ge=0, le=20)] | None = None
 
 
@@ -423,7 +423,7 @@ def protocol_json_schema(params_models: Mapping[str, type[StepParams]]) -> dict[
 
 
 def irreversible_warning(protocol: Protocol, step: Step) -> str:
-    """Say in plain words what cannot be undone after this step, and what is judged only when it is too late."""
+    """Say what cannot be undone after this step, and what is judged only when it is too late."""
     at = protocol.index(step.id)
     closed = [s.title for s in protocol.steps[:at] if s.photographs_specimen or s.id in step.requires]
     afterwards = [s.title for s in takewhile(lambda s: not s.begins_confirmed, protocol.steps[at + 1 :]) if s.gates]

@@ -127,7 +127,7 @@ def doi_address(text: str) -> str:
     """Return the address of a DOI, which may be given with or without `doi:` or `https://doi.org/`; "" for "".
 
     Raises:
-        DataError: it has another form.
+        DataError: it has another format.
     """
     if not text:
         return ""

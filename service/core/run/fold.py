@@ -151,7 +151,7 @@ def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, r
             state = deviate(state, event, "reset_by_redo", step, f"reset because {target} is done again: {reason}")
         if began or now.skipped:
             state = supersede(state, event, step, reason, None, now.captured)
-        # Count up even if nothing had begun, so that an outcome recorded later is known to be void.
+        # Count up even if nothing had started, so that an outcome recorded later is known to be void.
         state = replace(state, steps={**state.steps, step: StepState(step, attempt=now.attempt + 1)})
     return go(protocol, state, redo(target))
 

@@ -388,5 +388,5 @@ class RunState:
 
     @property
     def deviations_told(self) -> str:
-        """The number of deviations in words, such as `1 deviation`."""
+        """The number of deviations as text, such as `1 deviation`."""
         return counted(len(self.deviations), "deviation")

@@ -273,7 +273,7 @@ def checked(
 
 
 def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at: FieldPath = ()) -> YamlProblem:
-    """Return a pydantic error in plain words, with its line; the instance of `model` begins at path `at`."""
+    """Return a pydantic error in plain English, with its line; the instance of `model` begins at path `at`."""
     start = len(at)
     for part in details["loc"]:
         if (*at, part) in tree.lines:  # pydantic also puts names of union members into the path
@@ -306,7 +306,7 @@ def refuse(
         problems: the problems, one or more.
         what: the kind of file, such as "protocol".
         name: the file's name.
-        remedy: what the reader should do.
+        remedy: the advice to the reader.
         error: the class to raise.
     """
     ordered = sorted(set(problems), key=lambda p: (p.line, p.field))

@@ -116,7 +116,7 @@ def read_table(data: bytes, where: str, *, numbers_only: bool = False) -> TextTa
     """Return the fields of a file of delimited text.
 
     Raises:
-        DataError: another encoding, a quote that is not closed, or a form that can be read in two ways; `where` has
+        DataError: another encoding, a quote that is not closed, or a format that can be read in two ways; `where` has
             the line if it is one line's fault.
     """
     lines: list[tuple[int, str]] = []
@@ -239,7 +239,7 @@ def _decimal(rows: Iterable[Sequence[str]], separator: str, where: str) -> str:
 
 
 def _refuse_doubled(rows: Sequence[Sequence[str]], where: str) -> None:
-    """Raise if commas separate the fields and, by their count or form, also whole numbers from decimals."""
+    """Raise if commas separate the fields and, by their count or format, also whole numbers from decimals."""
     numbers = [row for row in rows if row and _WHOLE.fullmatch(row[-1])]
     if not numbers or len({len(row) for row in numbers}) > 1:
         return

@@ -52,7 +52,7 @@ _UNSEEN = frozenset(
 
 
 def person_name(typed: str) -> str:
-    """Return the name that was typed, in the one form in which names are stored.
+    """Return the name that was typed, in the one format in which names are stored.
 
     Raises ConfigurationError if it is not a person's name, or one that the software itself acts under.
     """

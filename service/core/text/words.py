@@ -8,7 +8,7 @@ from service.core.errors import OrthocaptureError
 
 
 def counted(number: int, one: str, more: str = "") -> str:
-    """Return a count in words: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""
+    """Return a count as text: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""
     return f"{number or 'no'} {one if number in (0, 1) else more or one + 's'}"
 
 

@@ -112,7 +112,7 @@ def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Art
     measures = {
         **found,
         "slices": float(series.slices),
-        "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # DICOM states positions with six decimal places
+        "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # DICOM gives positions with six decimal places
         "voxel_mm": round(mm(max(volume.spacing_m)), 6),
     }
     return JobRequest.of(ct_surface.KIND, arguments), kept + labels, measures

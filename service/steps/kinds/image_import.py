@@ -120,7 +120,7 @@ def _put(context: StepContext, listed: ImportList, file: ImportedFile, kind: str
 
 
 class StatedSettings(BaseModel):
-    """The settings that a photograph states; 0 and None: not stated."""
+    """The settings in a photograph's EXIF; 0 and None: not given."""
 
     aperture_f: float | None = None
     exposure_s: float | None = None

@@ -1,4 +1,4 @@
-"""What all arms of Universal Robots have in common: the form of their DH table, their links, and what may touch."""
+"""What all arms of Universal Robots have in common: their DH table's layout, their links, and what may touch."""
 
 from __future__ import annotations
 
