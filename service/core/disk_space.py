@@ -90,7 +90,7 @@ def forecast(
     Args:
         protocol: the run's protocol.
         state: the run's state; None before it begins.
-        here: sizes of its files so far.
+        here: the sizes of its files so far.
         state: the run's state; None before it begins.
         free_bytes: free space on the disk of the data folder.
         simulated: true for a simulated rig.

@@ -58,7 +58,7 @@ class Reference:
     """A part of an earlier job's answer.
 
     Attributes:
-        job: id of the job.
+        job: the job's id.
         field: keys and indices down to the part, separated by `/`, from `measures`, `artefacts` or `result`; `*`
             stands for every item of a list (`result/details/spheres/*/covariance_m2`).
     """
@@ -79,7 +79,7 @@ class Each:
 
     Attributes:
         jobs: prefixes of the jobs' keys (`step/generation/kind/`); the answers follow in the order of these prefixes.
-        upto_seq: only jobs that had finished by this event count.
+        upto_seq: the event by which jobs must have finished to count.
         field: the field of each answer, as in `Reference`.
         without: the ids of jobs to leave out, such as those of images that were taken again.
     """

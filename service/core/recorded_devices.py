@@ -114,8 +114,8 @@ class CameraBodies:
     """The serial numbers of a run's cameras.
 
     Attributes:
-        wires: serial number that a camera sends over its connection → device name in rig.yaml. Over USB a camera may
-            put digits of its model before those of the body.
+        wires: the device's name in rig.yaml, by the serial number that a camera sends over its connection. Over USB a
+            camera may put digits of its model before those of the body.
         stated: the distinct serial numbers in the photographs.
     """
 

@@ -47,8 +47,8 @@ def recovery_policy(recovery: Recovery, error: str, failures: int, *, starved: b
 
     Args:
         recovery: the step's policy from the protocol.
-        error: class name of the error that ended the work.
-        failures: consecutive failures of the step, including this one (StepState.failures + 1).
+        error: the class name of the error that ended the work.
+        failures: the number of consecutive failures of the step, including this one (StepState.failures + 1).
         starved: the computer had no processor time for the work, which explains a device that was late.
     """
     if error in NEEDS_A_PERSON:

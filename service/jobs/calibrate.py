@@ -15,7 +15,7 @@ class Arguments(BoardSize):
     Attributes:
         solve: the calibrations to solve.
         images: the images of the board.
-        camera: known intrinsics; None if they are solved.
+        camera: the known intrinsics; None if they are solved.
         corners: the file of the job `board_view` of each image; None if the image has not been searched.
         known: an estimate of camera, mount and board, with which images of a part of the board can be used.
         flatness_mm: the largest bow of the board; None: not given.

@@ -71,7 +71,7 @@ class KnownBoard(JobRecord):
     """An estimate of camera, mount and board, with its tolerances.
 
     Attributes:
-        camera: nominal, or estimated from the images like the two poses.
+        camera: the camera, nominal, or estimated from the images like the two poses.
         T_flange_camera: the camera's pose on the flange, (4, 4).
         T_base_board: the board's pose in the base frame, (4, 4).
         spread: (12, 12); possible increments of the two poses.
@@ -93,11 +93,11 @@ class BoardSeen(JobRecord):
     """The calibration board: inner corners, the edge of a square, and how it is bent.
 
     Attributes:
-        pattern: printed on it.
-        columns, rows: of inner corners.
-        square_mm: edge of a square.
+        pattern: the pattern printed on it.
+        columns, rows: the numbers of columns and rows of inner corners.
+        square_mm: the edge of a square.
         flatness_mm: the largest bow that was given.
-        bow_mm: how far its middle lies behind its sides, and behind its ends; None if it was taken as flat.
+        bow_mm: the distance of its middle behind its sides, and behind its ends; None if it was taken as flat.
         bow_sigma_mm: standard deviations of the two.
     """
 
@@ -133,8 +133,8 @@ class Intrinsics(JobRecord):
         board: the board that was seen.
         n_views: the number of images used.
         images: names of the images used.
-        rms_px: residual of all corners.
-        per_view_rms_px: residual of each image's corners, in the order of `images`.
+        rms_px: the rms residual of all corners.
+        per_view_rms_px: the rms residual of each image's corners, in the order of `images`.
         excluded: images that were not used.
         sigma: standard deviation of each free parameter of the camera, in the parameter's own unit.
         sigma_independent: the same if the errors of corners were independent.
@@ -166,7 +166,7 @@ class Intrinsics(JobRecord):
 
 
 class Spread(JobRecord):
-    """How well T_flange_camera is known.
+    """The uncertainty of T_flange_camera.
 
     Attributes:
         covariance: (6, 6), translation in m, then rotation in rad.
@@ -188,10 +188,10 @@ class Residuals(JobRecord):
     """Differences between the board pose from each image, by name, and the one from the other images.
 
     Attributes:
-        mm: position, in the fit.
-        deg: rotation, in the fit.
-        held_out_mm: position, predicted by the other images alone.
-        held_out_deg: rotation, predicted by the other images alone.
+        mm: the difference of position, in the fit.
+        deg: the difference of rotation, in the fit.
+        held_out_mm: the difference of position, predicted by the other images alone.
+        held_out_deg: the difference of rotation, predicted by the other images alone.
     """
 
     mm: dict[str, float] = Field(default_factory=dict)
@@ -274,13 +274,13 @@ class HandEye(JobRecord):
         sigma: the standard deviations of T_flange_camera.
         residuals: the residuals by image.
         robot_noise: the noise of the arm's poses.
-        setup: eye-in-hand for a camera on the flange, eye-to-hand for one beside the robot.
+        setup: the camera's place: eye-in-hand for one on the flange, eye-to-hand for one beside the robot.
         method: the method that gave T_flange_camera.
         methods: the transform by every method that gave an answer.
         spread: the differences between the methods.
         corner_sigma_px: standard deviation of a board corner.
         motion: the arm's motion between the images.
-        excluded: reason, by image that no fit used.
+        excluded: the reason, by image that no fit used.
         turned: images in which the board was seen turned by 180°.
         arm_held_out_rms_mm: the error of held-out images, by terms of the arm's model; "none": poses as reported.
         arm_correction: the answer with the arm's errors corrected; None if that does not improve held-out images.

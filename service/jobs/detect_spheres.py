@@ -30,7 +30,7 @@ class SceneArguments(ImagesCamera, Mounting):
 
 
 class Arguments(SceneArguments):
-    """How outlines are searched; `model` holds the poses if neither a robot nor spheres provide them.
+    """The way to search outlines; `model` holds the poses if neither a robot nor spheres provide them.
 
     `developed` holds the file of the job `develop` by viewpoint: outlines found in the photographs are then measured
     in these; None: in the photographs.

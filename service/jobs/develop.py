@@ -7,7 +7,7 @@ from service.jobs.records import Hash
 
 
 class Parameters(JobRecord):
-    """How the file is developed; the fields of DevelopParameters (service/compute/images/develop_parameters.py)."""
+    """The development parameters: the fields of DevelopParameters (service/compute/images/develop_parameters.py)."""
 
     demosaic: str
     white_balance: str

@@ -59,7 +59,7 @@ class Row(JobRecord):
         control_normalised_chi2: the χ² of that error against its predicted covariance, normalised.
         mean_radial_error_mm: the mean radial error as the paper defines it.
         mean_reprojection_error_px: the mean reprojection error as the paper defines it.
-        evaluated_on: `control spheres`, or `each sphere left out`.
+        evaluated_on: the spheres that were compared: `control spheres`, or `each sphere left out`.
         control_outlines: number of outlines compared.
         control_spheres: each control sphere by itself; empty in jobs of earlier versions.
         late: a text that says when the row arrived, if that was after the evaluation.

@@ -7,7 +7,7 @@ from service.jobs.records import ImageFile, ImagesCamera
 
 
 class SfmEffort(JobRecord):
-    """How much effort structure from motion makes; SfmOptions has further fields, and the same defaults.
+    """The effort of structure from motion; SfmOptions has further fields, and the same defaults.
 
     Attributes:
         max_image_size: the longer side, px, of the reduced images in which features are searched.

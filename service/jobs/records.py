@@ -167,7 +167,7 @@ class BoardSize(JobRecord):
 
 
 class Limits(JobRecord):
-    """When a view counts for a point of the specimen's surface."""
+    """The limits within which a view counts for a point of the specimen's surface."""
 
     min_views: int
     max_angle_deg: float

@@ -194,7 +194,7 @@ def _work(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> _Work:
 
 @dataclass(frozen=True, slots=True)
 class _JobTimes:
-    """How long the jobs of a run take."""
+    """The durations of a run's jobs."""
 
     state: RunState
     started_utc: Mapping[str, str]

@@ -198,7 +198,7 @@ class _CarriedBy(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class CameraMounting:
-    """How the camera was mounted on the arm, and the references that are recorded in its place."""
+    """The camera's mounting on the arm, and the references that are recorded in its place."""
 
     mounting: Mounting
     references: Mapping[str, Reference | Each | None]

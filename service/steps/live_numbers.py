@@ -86,7 +86,7 @@ ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
 
 
 class CoverageRule(Record):
-    """When a view counts for a point of the specimen's surface."""
+    """The rules by which a view counts for a point of the specimen's surface."""
 
     min_views: Annotated[int, Field(ge=1)] = 2  # views that must see the point
     # Angle between the viewing ray and the normal of the surface.

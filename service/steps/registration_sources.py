@@ -29,13 +29,13 @@ class WantedRegistrations(BaseModel):
     """The registrations that the parameters of a registration step ask for, and the images that they use.
 
     Attributes:
-        images_of: capture steps.
+        images_of: the capture steps' ids.
         control_images_of: capture steps that see the control spheres.
         calibration: the step with the intrinsics.
-        poses: sources.
+        poses: the sources of the poses.
         hand_eye: steps with the mount of the camera on its arm.
-        reduced: sizes of reduced images, such as 1920x1080.
-        reduced_poses: sources for the reduced images.
+        reduced: the sizes of reduced images, such as 1920x1080.
+        reduced_poses: the sources of the poses for the reduced images.
         structure_from_motion: the limits on image size, features and pairs.
     """
 

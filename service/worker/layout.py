@@ -179,10 +179,10 @@ def _draw_move(picture: NDArray[np.uint8], move: PhotographedMove, outline: Arra
     """Draw the new place of a sphere, and an arrow from rim to rim, which leaves the number legible.
 
     Args:
-        picture: drawn into.
+        picture: the picture that is drawn into.
         move: the move.
         outline: (n, 2) pixels of the sphere's outline about its middle.
-        thick: width of a thin line, in pixels.
+        thick: the width of a thin line, in pixels.
     """
     way = move.to_px - move.from_px
     length = float(np.linalg.norm(way))

@@ -143,7 +143,7 @@ def work_side_by_side(
     Args:
         data: the data folder.
         at_once: number of background jobs in parallel; there may be as many again that a step waits for.
-        until_idle: end when no job is open.
+        until_idle: true to end when no job is open.
         stop: called several times a second.
         progress: called with what a job does, how much is done, and the total.
 

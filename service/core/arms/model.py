@@ -25,7 +25,7 @@ class Link:
 
     Attributes:
         name: the part's name, as technicians know it.
-        frame: 0 is the base, k the frame after joint k.
+        frame: the frame's number: 0 is the base, k the frame after joint k.
         start_m: (3,) one end of the segment in that frame.
         end_m: (3,) the other end.
         radius_m: the capsule's radius.

@@ -33,10 +33,10 @@ def evaluate_gates(
     Args:
         step: the step with its gates.
         attempt: the attempt that measured.
-        measures: measure → value, in the unit of its gate.
+        measures: the value of each measure, in the unit of its gate.
         skipped: identifiers of skipped steps. A gate that names one in `unless_skipped` is not judged, because the
             number does not exist without that step. The skip and its reason are in the record.
-        uncertainties: measure → uncertainty, where one is known.
+        uncertainties: the uncertainty of each measure, where one is known.
     """
     gates = [gate for gate in step.gates if gate.unless_skipped is None or gate.unless_skipped not in skipped]
     verdicts = judge(gates, measures, uncertainties)

@@ -144,7 +144,7 @@ class CameraSection(Record):
 
 
 class Motion(Record):
-    """How the arm moves between viewpoints."""
+    """The arm's motion between viewpoints."""
 
     speed_rad_s: Positive = 0.5  # the speed of the fastest joint
     acceleration_rad_s2: Positive = 0.5  # the acceleration of the fastest joint
@@ -154,7 +154,7 @@ class Motion(Record):
 
 
 class Settle(Record):
-    """When the arm counts as standing still, and how long to wait for it."""
+    """The conditions on which the arm counts as standing still, and the longest wait for them."""
 
     window_s: Positive = 0.5  # over which all limits must hold
     joint_speed_rad_s: Positive = 0.001  # largest of any joint
@@ -348,7 +348,7 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]]
 
     Args:
         content: the file's bytes.
-        params_models: step kind → its Params.
+        params_models: the Params model of each step kind.
         name: the file's name in error messages.
 
     Raises:

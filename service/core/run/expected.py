@@ -21,7 +21,7 @@ EarlierTimes = Mapping[str, Sequence[float]]  # step → seconds that its work t
 
 @dataclass(frozen=True, slots=True)
 class UsualTime:
-    """How long the work of a step usually takes, and from where that is known."""
+    """The usual duration of a step's work, and the source of this knowledge."""
 
     seconds: float
     longest_s: float

@@ -46,7 +46,7 @@ class NotedView(_NoteRecord):
 
     Attributes:
         viewpoint: its name.
-        outcome: feasible, nudged, or refused where the arm cannot take it.
+        outcome: the planner's answer: feasible, nudged, or refused where the arm cannot take it.
         reason: the reason of a refusal.
         nudge_deg: the angle by which it was turned along its arc so that the arm can take it.
         joints_rad: the arm's joints there; None if refused.
@@ -73,7 +73,7 @@ class NotedStation(_NoteRecord):
 
 
 class NotedMotionPlan(_NoteRecord):
-    """How the arm moves in a capture."""
+    """The arm's motion in a capture."""
 
     stations: tuple[NotedStation, ...] = ()
 

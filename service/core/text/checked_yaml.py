@@ -264,7 +264,7 @@ def checked(
         data: the data at `at` in the file.
         model: the pydantic model of that part.
         tree: the file, for line numbers.
-        at: path to the part within the file.
+        at: the path to the part within the file.
     """
     try:
         return model.model_validate_json(json.dumps(data), strict=True), []

@@ -34,11 +34,11 @@ _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "spaces"}
 
 @dataclass(frozen=True, slots=True)
 class TextDialect:
-    """How the fields of a file are written.
+    """The way in which a file writes its fields.
 
     Attributes:
-        separator: "," or ";" or a tab, or " " for any run of spaces and tabs.
-        decimal: "." or ",".
+        separator: the character between fields: "," or ";" or a tab, or " " for any run of spaces and tabs.
+        decimal: the decimal mark: "." or ",".
     """
 
     separator: str

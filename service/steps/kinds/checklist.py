@@ -26,7 +26,7 @@ class Measures(MeasureRecord):
 
 
 class Result(Record):
-    """How many items were ticked."""
+    """The number of items that were ticked."""
 
     items: int
     ticked: int

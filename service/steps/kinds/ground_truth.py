@@ -139,7 +139,7 @@ class Measures(MeasureRecord):
 
 
 class Result(Record):
-    """How the ground truth was made, as the job reports it. Without a CT nothing is fused: the scan is the truth."""
+    """The ground truth's making, as the job reports it. Without a CT nothing is fused: the scan is the truth."""
 
     without: str = ""  # the skipped step that it would need
     registration: str = ""  # name of the registration that closed the loop

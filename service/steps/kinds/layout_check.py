@@ -37,7 +37,7 @@ _SIDES: tuple[tuple[str, str], ...] = (
 
 
 class Params(StepParams):
-    """How many photographs are taken, and how."""
+    """The number of photographs, and the way they are taken."""
 
     gives: ClassVar = "rough_spheres"
     repeated: ClassVar = RepeatedStep("Move the spheres as it says, then take another photograph")

@@ -47,7 +47,7 @@ from service.steps.registration_sources import (
 
 
 class StructureFromMotion(Record):
-    """How much effort structure from motion makes: more features and pairs take longer."""
+    """The effort of structure from motion: more features and pairs take longer."""
 
     max_image_size: int = 3200  # features are searched in images reduced to this longer side, px
     max_features: int = 8000  # features per image

@@ -30,7 +30,7 @@ class Params(StepParams):
 
 
 class Measures(MeasureRecord):
-    """That the product was applied."""
+    """The fact that the product was applied."""
 
     applications: Annotated[Count, "times that the product was applied"] = None
 
@@ -44,7 +44,7 @@ class _Applied(BaseModel):
 
 
 class Result(Record):
-    """When the coating was applied, in both clocks of the host, and its times."""
+    """The time of the coating, in both clocks of the host, and its limits."""
 
     product: str
     applied_monotonic_s: float

@@ -46,7 +46,7 @@ def lbr(
 
     Args:
         name: the arm's name as the controller gives it.
-        offsets_m: base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange.
+        offsets_m: the distances base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange.
         limits_deg: (7,) range of each joint to each side.
         speeds_deg_s: (7,) largest speeds of the joints.
         payload_kg: the largest load on the flange.

@@ -50,10 +50,10 @@ def universal_robot(
     Args:
         name: the arm's name as the controller gives it.
         a_m: lengths of upper arm and forearm, negative.
-        d_m: offsets 1, 4, 5 and 6.
+        d_m: the offsets 1, 4, 5 and 6.
         speeds_deg_s: (6,) largest speeds of the joints, as the data sheet gives them.
         payload_kg: the largest load on the flange.
-        elbow_deg: range of the elbow to each side; all others turn by 360°.
+        elbow_deg: the range of the elbow to each side; all others turn by 360°.
     """
     half = np.pi / 2
     limits_deg = np.array([360.0, 360.0, elbow_deg, 360.0, 360.0, 360.0])

@@ -29,7 +29,7 @@ class RunStarted(Record):
 
 
 class HostClock(Record):
-    """How well the host's clock is set; None stands for not known."""
+    """The host clock's synchronisation; None stands for not known."""
 
     source: Literal["chrony", "kernel", ""]
     synchronised: bool | None  # true if synchronised with the network's time
@@ -101,7 +101,7 @@ class StepStarted(Record):
 
 
 class StepNote(Record):
-    """Something a step found out that belongs in the record (station entered, timer started, …)."""
+    """A finding of a step that belongs in the record (station entered, timer started, …)."""
 
     kind: Literal["step_note"] = "step_note"
     step: str
@@ -122,7 +122,7 @@ class FilesKept(Record):
 
 
 class Uncertainty(Record):
-    """How well a measured number is known, in the number's own unit."""
+    """The uncertainty of a measured number, in the number's own unit."""
 
     sigma: float  # standard deviation
     lower: float  # the true value is above this with 99 % confidence (one-sided)
