@@ -72,7 +72,7 @@ class ImportFolders:
 def find_places(
     folder: Path, given: Mapping[PhotographRole | FileRole, Path | None], wanted: Set[PhotographRole | FileRole]
 ) -> ImportFolders:
-    """The places of the wanted parts: those given, else subfolders with one of the names in FOLDERS.
+    """Return the places of the wanted parts: those given, else subfolders with one of the names in FOLDERS.
 
     Raises DataError if the folder or a given place does not exist, or if a part is given that is not wanted.
     """
@@ -96,12 +96,12 @@ def find_places(
 
 @dataclass(frozen=True, slots=True)
 class CtReading:
-    """What a rig.yaml would say of the CT series.
+    """The settings that a rig.yaml would have for the CT series.
 
     Attributes:
-        first_number: of the first slice of a whole series.
+        first_number: the number of the first slice of a whole series.
         series: a part of the description of the series to use, where there are several.
-        unspecified_is_hounsfield: values of a series that states no unit are Hounsfield units.
+        unspecified_is_hounsfield: true if values of a series without a unit are Hounsfield units.
     """
 
     first_number: int = 1
@@ -109,7 +109,7 @@ class CtReading:
     unspecified_is_hounsfield: bool = False
 
     def device(self, folder: Path) -> dict[str, Any]:
-        """The section of the device that reads a folder so."""
+        """Return the section of the device that reads a folder so."""
         given = {one.name: value for one in fields(self) if (value := getattr(self, one.name)) != one.default}
         return {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0, **given}
 
@@ -120,7 +120,7 @@ def list_import(
     *,
     ct: CtReading | None = None,
 ) -> ImportList:
-    """Every file to be imported, with its hash, and the files left out, with the reasons.
+    """Return every file to be imported, with its hash, and the files left out, with the reasons.
 
     Raises:
         DataError: photographs are damaged or missing, or there is not exactly one complete scan or CT series.
@@ -149,7 +149,7 @@ def list_import(
 
 
 def import_rig(listing: ImportList, *, simulated: bool, ct: CtReading | None = None) -> Rig:
-    """The rig of an import's run: the list, with the folders of scan and CT as devices."""
+    """Return the rig of an import's run: the list, with the folders of scan and CT as devices."""
     devices: dict[str, dict[str, Any]] = {}
     for role in _SCANS:
         if listing.holds(role):
@@ -211,7 +211,7 @@ def _views(places: ImportFolders, progress: Progress) -> tuple[list[ImportedView
 
 
 def camera_record(exif: ExifRecord) -> dict[str, Any]:
-    """Camera, lens and settings stated in a photograph's EXIF, with the keys used in capture events."""
+    """Return camera, lens and settings given in a photograph's EXIF, with the keys used in capture events."""
     stated: dict[str, Any] = {
         "make": exif.make,
         "model": exif.model,
@@ -234,7 +234,7 @@ def camera_record(exif: ExifRecord) -> dict[str, Any]:
 
 
 def _names(photographs: Sequence[tuple[PhotographRole, Path]], places: ImportFolders) -> dict[Path, str]:
-    """A name for each view: the file's stem, with its folders in front if several files have the same stem."""
+    """Return a name for each view: the file's stem, with its folders in front if several files have the same stem."""
     stems = [_plain(path.stem) for _, path in photographs]
     names: dict[Path, str] = {}
     taken: set[str] = set()
@@ -252,7 +252,7 @@ def _names(photographs: Sequence[tuple[PhotographRole, Path]], places: ImportFol
 
 
 def _plain(text: str) -> str:
-    """A valid name of a view: letters, digits and `_.-+`; the last 56 characters, where cameras put their counter."""
+    """Return a valid name of a view: letters, digits and `_.-+`; the last 56 characters, where cameras count."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "_.-+") else "_" for c in text)[-56:]
 
 
@@ -284,7 +284,7 @@ def _none(role: PhotographRole, places: ImportFolders, left_out: Sequence[LeftOu
 
 
 def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
-    """The files of a mesh, given as a file or as a folder with only one mesh, and the other files there."""
+    """Return the files of a mesh, given as a file or as a folder with only one mesh, and the other files there."""
     option = f"--{role.replace('_', '-')}"
     if place.is_file():
         meshes, others = [place], []
@@ -308,7 +308,7 @@ def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
 
 
 def _ct(folder: Path, reading: CtReading) -> tuple[tuple[Path, ...], list[LeftOut]]:
-    """The slices of the only complete series in a folder, and the other files there."""
+    """Return the slices of the only complete series in a folder, and the other files there."""
     section = RigSection(name="CT", devices={"ct": reading.device(folder)})
     station = Station(Rig(section, folder / "import-list.json", b""))
     try:
@@ -334,7 +334,7 @@ def _ct(folder: Path, reading: CtReading) -> tuple[tuple[Path, ...], list[LeftOu
 
 
 def _elsewhere(places: ImportFolders) -> list[LeftOut]:
-    """Files of the folder that are in none of its parts."""
+    """Return the files of the folder that are in none of its parts."""
     parts = [
         place
         for place in (
@@ -355,7 +355,7 @@ def _companions(mesh: Path) -> Iterable[Path]:
     return export_of(mesh).files
 
 
-# --- words and records ------------------------------------------------------------------------------------------
+# --- texts and records ------------------------------------------------------------------------------------------
 
 
 def _file(file: ListedFile, places: ImportFolders, media_type: str = "application/octet-stream") -> ImportedFile:
@@ -369,7 +369,7 @@ def _file(file: ListedFile, places: ImportFolders, media_type: str = "applicatio
 
 
 def _shown(path: Path, places: ImportFolders) -> str:
-    """A path relative to the import's folder, or absolute if outside it."""
+    """Return a path relative to the import's folder, or absolute if outside it."""
     return str(path.relative_to(places.folder) if path.is_relative_to(places.folder) else path)
 
 

@@ -88,7 +88,7 @@ def _plain(name: str) -> str:
 
 
 def _checked(photograph: NotePhotograph) -> tuple[str, str]:
-    """Media type and file suffix, after decoding the picture. Raises DataError."""
+    """Decode the picture; return its media type and file suffix. Raises DataError."""
     # The decoder takes long to load, and a web process starts without it.
     import cv2  # noqa: PLC0415
 

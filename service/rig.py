@@ -43,7 +43,7 @@ class ObstacleSection(Record):
 
     from_m: Vector3  # one end of the rod's axis, in the station's base frame
     to_m: Vector3  # the other end
-    radius_m: Annotated[float, Field(gt=0, lt=1)]  # of the rod, with its round ends
+    radius_m: Annotated[float, Field(gt=0, lt=1)]  # the rod's radius, with its round ends
 
 
 class StationSection(Record):
@@ -60,13 +60,13 @@ class PayloadSection(Record):
     """The load on the flange."""
 
     mass_kg: Annotated[float, Field(gt=0, lt=50)]  # camera, lens and mount together
-    centre_of_gravity_m: Vector3  # in the flange frame
+    centre_of_gravity_m: Vector3  # the position in the flange frame
 
 
 class CollisionSection(Record):
     """Obstacles for the planner; the defaults suit a UR10e with a full-frame camera over a board on a table."""
 
-    arm: str | None = None  # arm model, such as UR10e; None: as the controller states it
+    arm: str | None = None  # arm model, such as UR10e; None: as the controller gives it
     table_below_scene_m: float = 0.07  # distance of the table's top below the scene's centre
     specimen_size_m: Vector3 = (
         0.34,
@@ -75,16 +75,16 @@ class CollisionSection(Record):
     )  # along the approach, across it, up; spheres included
     camera_from_m: Vector3 = (0.0, 0.0, -0.09)  # axis of a capsule around body and lens, in the camera's frame
     camera_to_m: Vector3 = (0.0, 0.0, 0.05)  # the other end of that axis
-    camera_radius_m: Annotated[float, Field(gt=0, lt=0.3)] = 0.06  # of that capsule
+    camera_radius_m: Annotated[float, Field(gt=0, lt=0.3)] = 0.06  # the radius of that capsule
     margin_m: Annotated[float, Field(ge=0, lt=0.2)] = 0.01  # smallest clearance
 
 
 class OpticsSection(Record):
     """The lens, for computing the depth of field."""
 
-    focal_length_mm: Annotated[float, Field(gt=0)]  # as it is taped
-    aperture_f: Annotated[float, Field(gt=0)]  # as it is set
-    focus_distance_m: Annotated[float, Field(gt=0)]  # from the camera
+    focal_length_mm: Annotated[float, Field(gt=0)]  # the focal length as it is taped
+    aperture_f: Annotated[float, Field(gt=0)]  # the aperture as it is set
+    focus_distance_m: Annotated[float, Field(gt=0)]  # the distance from the camera
     blur_um: Annotated[float, Field(gt=0)] = 45.0  # circle of confusion on the sensor, 12 px of 3.76 µm
 
 
@@ -95,10 +95,10 @@ class LensSection(Record):
     sensor_width_mm: Annotated[float, Field(gt=0)]  # width of the sensor
     image_px: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]  # width and height of the photographs
     focus_distance_m: Annotated[float, Field(gt=0.05)] | None = None  # from the camera; None: focused far away
-    tolerance: Annotated[float, Field(gt=0, lt=0.5)] = 0.025  # of the focal length, relative
+    tolerance: Annotated[float, Field(gt=0, lt=0.5)] = 0.025  # the relative tolerance of the focal length
 
     def focal_px(self, width_px: int) -> float:
-        """Focal length in pixels for images of this width, with the lens's extension at close focus."""
+        """Return the focal length in pixels for images of this width, with the lens's extension at close focus."""
         f_m = metres(self.focal_length_mm)
         extended = 1.0 if self.focus_distance_m is None else self.focus_distance_m / (self.focus_distance_m - f_m)
         return self.focal_length_mm * extended / self.sensor_width_mm * width_px
@@ -125,9 +125,9 @@ class FurtherCameraSection(Record):
 class TimestampSection(Record):
     """A time-stamp authority (RFC 3161) that is asked at the end of every run; the run ends even if it fails."""
 
-    url: Annotated[str, Field(pattern=r"^https?://")]  # where the authority answers
+    url: Annotated[str, Field(pattern=r"^https?://")]  # the address where the authority answers
     certificates: str  # PEM file, relative to the rig file: the authority's root and intermediate certificates
-    timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0  # for its answer
+    timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0  # the time limit for its answer
 
 
 class WebhookSection(Record):
@@ -149,8 +149,8 @@ class EmailSection(Record):
     to: Annotated[tuple[str, ...], Field(min_length=1)]  # addresses
     sender: str  # address that the mail comes from
     host: str  # the mail server
-    port: Annotated[int, Field(gt=0, lt=65536)] = 587  # of the mail server
-    starttls: bool = True  # whether the connection is encrypted
+    port: Annotated[int, Field(gt=0, lt=65536)] = 587  # the mail server's port
+    starttls: bool = True  # true if the connection is encrypted
     user: str = ""  # name at the mail server; empty: no sign-in
     password_env: str = ""  # environment variable that holds the password
 
@@ -160,12 +160,12 @@ class AlertsSection(Record):
 
     webhook: WebhookSection | None = None  # a web address to notify
     email: EmailSection | None = None  # people to write to
-    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # what is told
-    waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # how long a run waits for a person before an alert
+    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # the reported events
+    waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # a run's wait for a person before an alert
 
 
 class SigningSection(Record):
-    """What may replace the password when a step is signed or figures are accepted; the password always works."""
+    """The replacements for the password when a step is signed or figures are accepted; the password always works."""
 
     pin: bool = False  # a PIN may
     badge: bool = False  # read by a reader that types the code and Enter
@@ -173,31 +173,31 @@ class SigningSection(Record):
 
 @dataclass(frozen=True, slots=True)
 class RigDevice:
-    """What the driver of a device in the rig file says of it."""
+    """The driver's statements about a device in the rig file."""
 
     kind: str  # robot, camera, scanner, ct or lightbox
-    abandoned: Abandoned | None  # what becomes of its motion if the program that drives it dies
+    abandoned: Abandoned | None  # the end of its motion if the program that drives it dies
 
 
 class RigSection(Record):
     """The rig file."""
 
-    name: str  # of the site or the room, as people know it
+    name: str  # the name of the site or the room, as people know it
     simulated: bool = False  # devices are simulators: everything recorded is marked so
     hands: str | None = None  # HOST:PORT of a simulated technician (simulated rigs only)
     devices: dict[str, dict[str, Any]]  # by a name of your choice: robot, camera, scanner and so on; see Devices
     cameras: dict[str, FurtherCameraSection] = Field(default_factory=dict)  # further cameras, by their device's name
-    stations: dict[str, StationSection] = Field(default_factory=dict)  # by the name that protocols use
+    stations: dict[str, StationSection] = Field(default_factory=dict)  # the stations, by the name that protocols use
     # The camera mount's drawing: a rigid 4×4 matrix, metres; the calibration replaces it.
     T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
-    payload: PayloadSection | None = None  # what the arm is told it carries
-    collision: CollisionSection = CollisionSection()  # what the plan of motions keeps clear of
+    payload: PayloadSection | None = None  # the payload that the arm is configured for
+    collision: CollisionSection = CollisionSection()  # the things that the plan of motions avoids
     optics: OpticsSection | None = None  # None: depth of field is not judged
     lens: LensSection | None = None  # required if the software plans the board poses
     timestamp: TimestampSection | None = None  # None: no time stamps
     signature_copy: str | None = None  # file elsewhere, such as on a share, that gets a copy of the log of signatures
     alerts: AlertsSection | None = None  # None: no alerts
-    signing: SigningSection = SigningSection()  # what may stand for a password
+    signing: SigningSection = SigningSection()  # the replacements for a password
     imported: ImportList | None = None  # the files of an import; None for a run that captures
 
 
@@ -216,7 +216,7 @@ class Rig:
         return self.path.parent
 
     def nominal_T_flange_camera(self) -> Transform:
-        """T_flange_camera (4, 4) in metres from the mount's drawing.
+        """Return T_flange_camera (4, 4) in metres from the mount's drawing.
 
         Raises ConfigurationError if the rig file has none, or if it is not rigid.
         """
@@ -244,7 +244,7 @@ def load_rig(path: Path) -> Rig:
 
 
 def read_rig(path: Path) -> bytes:
-    """The bytes of a rig file. Raises ConfigurationError if it cannot be read."""
+    """Return the bytes of a rig file. Raises ConfigurationError if it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
@@ -263,7 +263,7 @@ def read_rig(path: Path) -> bytes:
 
 
 def parse_rig(source: bytes, path: Path) -> Rig:
-    """The rig in a file's bytes. Raises ConfigurationError that lists every problem with line and field."""
+    """Return the rig in a file's bytes. Raises ConfigurationError that lists every problem with line and field."""
     tree = _tree(source, path)
     section, problems = checked(tree.data, RigSection, tree)
     problems += tree.problems
@@ -274,7 +274,7 @@ def parse_rig(source: bytes, path: Path) -> Rig:
 
 
 def parse_recorded_rig(source: bytes, path: Path) -> Rig:
-    """The rig of a recorded run, read with the type conversions that older versions allowed.
+    """Return the rig of a recorded run, read with the type conversions that older versions allowed.
 
     Raises ConfigurationError if the bytes are not a rig file.
     """
@@ -310,7 +310,7 @@ def _violations(data: Plain) -> Iterator[tuple[FieldPath, str]]:
 
 
 def _tree(source: bytes, path: Path) -> YamlTree:
-    """The file as plain data. Raises ConfigurationError if it is neither YAML nor JSON, or not a mapping."""
+    """Return the file as plain data. Raises ConfigurationError if it is neither YAML nor JSON, or not a mapping."""
     # An import's list is JSON of thousands of lines, which would take seconds to parse as YAML.
     try:
         tree = _read_json(source, path) if source.startswith(b"{") else _read_yaml(source, path)

@@ -77,7 +77,7 @@ def cancel_computation(store: Store, run_id: str, job: str, reason: str, *, acto
 def see_robot(log: RunRecord, device: str, lost_seq: int, *, driven: bool, actor: str) -> None:
     """Record that a person has looked at an arm whose connection was lost. Nothing moves by it.
 
-    `lost_seq` is the event of the loss that the person was told of, 0 for an arm that was only left alone; `driven`
+    `lost_seq` is the event of the loss that was shown to the person, 0 for an arm that was only left alone; `driven`
     says whether a process drives the run. Raises IllegalTransitionError if it stands otherwise with the arm.
     """
     loss = lost_arms(log.state).get(device)
@@ -92,7 +92,7 @@ def see_robot(log: RunRecord, device: str, lost_seq: int, *, driven: bool, actor
 
 
 def drawing_step(log: RunRecord) -> str:
-    """The step for whose next fusion a region can be drawn now; "" if there is none.
+    """Return the step for whose next fusion a region can be drawn now; "" if there is none.
 
     It needs the registered scene, in whose frame the region is, and a run that has not ended.
     """
@@ -102,7 +102,7 @@ def drawing_step(log: RunRecord) -> str:
 
 
 def step_to_draw_for(log: RunRecord) -> str:
-    """As `drawing_step`. Raises IllegalTransitionError if there is none."""
+    """Return the `drawing_step`. Raises IllegalTransitionError if there is none."""
     step = drawing_step(log)
     if not step:
         raise IllegalTransitionError(
@@ -114,14 +114,14 @@ def step_to_draw_for(log: RunRecord) -> str:
 
 
 def out_of_date(state: RunState) -> IllegalTransitionError:
-    """The refusal of an answer to something that the run no longer asks."""
+    """Return the refusal of an answer to something that the run no longer asks."""
     return IllegalTransitionError(
         "the page was out of date: the run has gone on since it was shown", where=state.current, remedy=DECIDE_AGAIN
     )
 
 
 def read_region(step: str, source: Literal["ct", "scan"], corners: str, along: str) -> RegionDrawn:
-    """A region from its texts: corners and direction as JSON, in the frame of the scan, metres.
+    """Return a region from its texts: corners and direction as JSON, in the frame of the scan, metres.
 
     Raises ConfigurationError if they are not a polygon on the scene.
     """

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def recorded_root(store: Store, run_id: str) -> RunStarted:
-    """The payload of a run's first event. Raises IntegrityError if it is not run_started."""
+    """Return the payload of a run's first event. Raises IntegrityError if it is not run_started."""
     root = store.first_event(run_id).payload
     if not isinstance(root, RunStarted):
         raise IntegrityError("the run's first event is not run_started", where=run_id, remedy=RESTORE)
@@ -39,7 +39,10 @@ def recorded_root(store: Store, run_id: str) -> RunStarted:
 
 
 def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
-    """The protocol as recorded when a run began. Raises IntegrityError if altered, ProtocolError if not readable."""
+    """Return the protocol as recorded when a run began.
+
+    Raises IntegrityError if altered, ProtocolError if not readable.
+    """
     content = store.artefact_path(root.protocol.sha256, verify=True).read_bytes()
     return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol
 
@@ -55,7 +58,7 @@ class RunRecord:
     state: RunState
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
-        """The valid captures of a step's current attempt, in the order of capture."""
+        """Return the valid captures of a step's current attempt, in the order of capture."""
         payloads = (self.events[seq - 1].payload for seq in sorted(self.state.steps[step_id].captured.values()))
         return tuple(payload for payload in payloads if isinstance(payload, RecordedView))
 
@@ -93,7 +96,7 @@ class RunFollower:
             return self._read()
 
     def now(self) -> RunRecord:
-        """The record up to now. Raises IntegrityError for an impossible event."""
+        """Return the record up to now. Raises IntegrityError for an impossible event."""
         with self._reading:
             state = self._read()
             if self._log is None or self._log.state is not state:
@@ -105,7 +108,7 @@ class RunFollower:
         known = len(self._events)
         if self.store.head(self.run_id) != known:  # steps that wait look often, and seldom is anything new
             for event in self.store.events(self.run_id, after_seq=known):
-                # Fold first: an event that is refused must not be kept.
+                # Fold first: an event that is refused must not be stored.
                 self._state = advance(self.protocol, self._state, event)
                 self._events.append(event)
         if self._state.leave != leave:
@@ -115,12 +118,12 @@ class RunFollower:
 
 
 def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
-    """A run's record as of now, for a single read. Raises IntegrityError for an impossible event."""
+    """Return a run's record as of now, for a single read. Raises IntegrityError for an impossible event."""
     return RunFollower(store, run_id, protocol).now()
 
 
 def results_to_come(log: RunRecord) -> list[PendingResult]:
-    """The planned registrations that have not arrived yet, with the time left; empty if all have."""
+    """Return the planned registrations that have not arrived yet, with the time left; empty if all have."""
     from service.steps.due_jobs import missing_results  # noqa: PLC0415 - most job kinds
 
     started = log.store.jobs_started(log.run_id)
@@ -131,7 +134,7 @@ def results_to_come(log: RunRecord) -> list[PendingResult]:
 
 @dataclass(frozen=True, slots=True)
 class OpenJob:
-    """A job of a run that waits or is computed: its name, step and words, and how it stands."""
+    """A job of a run that waits or is computed: its name, step and label, and its state."""
 
     job: str
     step: str
@@ -140,12 +143,12 @@ class OpenJob:
 
     @property
     def text(self) -> str:
-        """On a line of its own."""
+        """The comment's text on a line of its own."""
         return f"{self.words} of step {self.step}, {self.standing}"
 
 
 def open_jobs(log: RunRecord) -> list[OpenJob]:
-    """The jobs of a run that are computed, and those in the queue for which a step waits, the oldest first."""
+    """Return the jobs of a run that are computed, and those in the queue for which a step waits, the oldest first."""
     waiting = waiting_for_memory(log.store.database_path.parent)
     started = log.store.jobs_started(log.run_id)
     jobs = [(name, job) for name, step in log.state.steps.items() for job in step.jobs.values()]
@@ -184,15 +187,15 @@ class StepEvidence:
         return self.log.store.put_bytes(data, kind=kind, media_type=media_type, original_name=original_name)
 
     def path(self, ref: ArtefactRef) -> Path:
-        """The file of an artefact. Raises IntegrityError if it is missing."""
+        """Return the file of an artefact. Raises IntegrityError if it is missing."""
         return self.log.store.artefact_path(ref.sha256)
 
     def holds(self, sha256: str) -> bool:
-        """Whether the run has recorded a file with this content."""
+        """Return whether the run has recorded a file with this content."""
         return self.log.store.holds(self.log.run_id, sha256)
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
-        """The valid captures of a step's current attempt, in the order of capture."""
+        """Return the valid captures of a step's current attempt, in the order of capture."""
         return self.log.now().captures(step_id)
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
@@ -249,20 +252,20 @@ class StepEvidence:
             self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """What people at screens have asked of this step, in order."""
+        """Return what people at screens have asked of this step, in order."""
         return self.log.refresh().steps[self.step].asked
 
     def computing(self) -> bool:
-        """Whether a worker computes a job of this run at this moment."""
+        """Return whether a worker computes a job of this run at this moment."""
         return bool(self.log.store.jobs_started(self.log.run_id))
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
-        """The jobs of a step, in the order in which they were enqueued."""
+        """Return the jobs of a step, in the order in which they were enqueued."""
         jobs = self.log.refresh().steps[step_id].jobs.values()
         return tuple(sorted(jobs, key=lambda job: job.enqueued_seq))
 
     def state(self) -> RunState:
-        """The run's state as of now. Raises IntegrityError for an impossible event."""
+        """Return the run's state as of now. Raises IntegrityError for an impossible event."""
         return self.log.refresh()
 
     def require_space(self) -> None:
@@ -270,5 +273,5 @@ class StepEvidence:
         self.space()
 
     def _key(self, request: JobRequest) -> str:
-        """A key that is the same for the same work, so that a restart or retry reuses the result."""
+        """Return the same key for the same work, so that a restart or retry reuses the result."""
         return job_key(self.log.refresh(), self.step, request.kind, arguments_name(request.arguments))

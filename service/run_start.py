@@ -33,12 +33,12 @@ def require_runnable(loaded: LoadedProtocol, rig: Rig, devices: Mapping[str, Rig
     Args:
         loaded: the protocol.
         rig: the rig. One without any device captures nothing, so that its stations and devices are not asked for.
-        devices: what the drivers say of the rig's devices, by name.
+        devices: the drivers' statements about the rig's devices, by name.
 
     Raises:
         ProtocolError: params name the wrong steps, a gate a measure that its step does not have, or a step a station
             that the rig does not have; or an arm would move too fast.
-        ConfigurationError: the rig lacks a device of a step.
+        ConfigurationError: the rig does not have a device of a step.
     """
     captures = bool(rig.section.devices)
     require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None, devices)
@@ -61,9 +61,9 @@ def start_run(
         store: the data folder.
         loaded: the protocol.
         rig: the rig.
-        operator: the person who begins the run.
-        auto_confirm: whether confirmations are automatic, on a simulated rig.
-        about: what was entered about the run.
+        operator: the person who starts the run.
+        auto_confirm: true for automatic confirmations, on a simulated rig.
+        about: the facts entered about the run.
 
     Raises:
         ConfigurationError: automatic confirmation is requested on a rig that is not simulated.
@@ -112,13 +112,13 @@ def record_refusal(
 
 
 def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:
-    """The protocol as recorded when the run began, and the payload of the run's first event."""
+    """Return the protocol as recorded when the run began, and the payload of the run's first event."""
     root = recorded_root(store, run_id)
     return recorded_protocol(store, root), root
 
 
 def recorded_rig(store: Store, root: RunStarted) -> Rig:
-    """The rig of a run, from its file; for an import, from the recorded list.
+    """Return the rig of a run, from its file; for an import, from the recorded list.
 
     Raises ConfigurationError if the rig file has changed since the run began.
     """
@@ -137,7 +137,7 @@ def recorded_rig(store: Store, root: RunStarted) -> Rig:
 
 
 def time_stamp_authority(rig: Rig) -> Authority | None:
-    """The authority that stamps the end of runs of this rig, or None."""
+    """Return the authority that stamps the end of runs of this rig, or None."""
     from service.store.signatures.timestamps import Authority  # noqa: PLC0415 - certificates, which `status` can do without
 
     section = rig.section.timestamp
@@ -145,13 +145,13 @@ def time_stamp_authority(rig: Rig) -> Authority | None:
 
 
 def signature_copy(rig: Rig) -> Path | None:
-    """The path of the copy of the log of signatures, or None."""
+    """Return the path of the copy of the log of signatures, or None."""
     named = rig.section.signature_copy
     return None if named is None else rig.folder / named
 
 
 def second_place(rig: Rig, store: Store) -> SecondPlace:
-    """The second place of the signatures of a data folder, as the rig names it."""
+    """Return the second place of the signatures of a data folder, as the rig names it."""
     return SecondPlace.of(store.database_path.parent, signature_copy(rig), store.clock, store.files)
 
 

@@ -66,7 +66,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 class Station:
-    """The devices of one rig, opened on first use and kept open until `close`."""
+    """The devices of one rig, opened on first use and left open until `close`."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -79,11 +79,11 @@ class Station:
         self._told: dict[str, int] = {}  # arm → seq of the last leave to move that it was given
 
     def names(self) -> tuple[str, ...]:
-        """Names of the devices, in the order of the rig file."""
+        """Return the names of the devices, in the order of the rig file."""
         return tuple(self.rig.section.devices)
 
     def device(self, name: str) -> Device:
-        """The device of this name, opened if need be. Raises ConfigurationError or DeviceError."""
+        """Return the device of this name, opened if need be. Raises ConfigurationError or DeviceError."""
         if name not in self._open:
             device = self._build(name)
             try:
@@ -97,7 +97,7 @@ class Station:
         return self._open[name]
 
     def report(self, name: str) -> DeviceReport:
-        """The report of a device, also of an arm that stands stopped and takes no payload.
+        """Return the report of a device, also of an arm that stands stopped and takes no payload.
 
         Raises ConfigurationError or DeviceError.
         """
@@ -116,10 +116,10 @@ class Station:
             self._unlock(name)
 
     def heard(self, name: str) -> tuple[RecordedDevice, Secrets]:
-        """All that a device says of itself, opened for this alone, and texts that must not leave with it.
+        """Return all that a device says of itself, opened for this alone, and texts that must not leave with it.
 
-        One that cannot be opened is given with the error and with what can be heard nevertheless. No arm is told its
-        payload. Raises ConfigurationError if its section of the rig file is wrong.
+        One that cannot be opened is given with the error and with what can be heard nevertheless. No arm's payload is
+        set. Raises ConfigurationError if its section of the rig file is wrong.
         """
         spec, _ = self._spec(name)
         config = self._config(name, spec)
@@ -147,7 +147,7 @@ class Station:
         return said, _secrets_of(config)
 
     def opened(self, kind: str) -> dict[str, Device]:
-        """The open devices of a kind, by name."""
+        """Return the open devices of a kind, by name."""
         # Copied first, because the reporter's thread calls this while devices are being opened.
         return {name: device for name, device in tuple(self._open.items()) if self.kind_of(name) == kind}
 
@@ -180,7 +180,7 @@ class Station:
     # --- devices by role, for steps (service.steps.context.Devices) ---
 
     def robot(self, station: str) -> RobotArm:
-        """The arm at a station, with the newest leave to move. Raises ConfigurationError or DeviceError."""
+        """Return the arm at a station, with the newest leave to move. Raises ConfigurationError or DeviceError."""
         name, leave = self.layout(station).robot, self._leave
         arm = cast(RobotArm, self.device(name))
         if leave is not None and self._told.get(name) != leave.seq:
@@ -197,11 +197,11 @@ class Station:
         self._leave = leave
 
     def camera(self) -> Camera:
-        """The rig's first camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
+        """Return the rig's first camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(Camera, self.device(self._only("camera")))
 
     def camera_named(self, name: str) -> Camera:
-        """A further camera by its name, or the first one for "". Raises ConfigurationError, DeviceError."""
+        """Return a further camera by its name, or the first one for "". Raises ConfigurationError, DeviceError."""
         if not name:
             return self.camera()
         if name not in self.rig.section.cameras:
@@ -211,7 +211,10 @@ class Station:
         return self._further(name, self.rig.section.cameras[name]).camera
 
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
-        """The rig's further cameras. Raises ConfigurationError if one is not a calibrated camera; DeviceError."""
+        """Return the rig's further cameras.
+
+        Raises ConfigurationError if one is not a calibrated camera; DeviceError.
+        """
         return tuple(self._further(name, section) for name, section in self.rig.section.cameras.items())
 
     def _further(self, name: str, section: FurtherCameraSection) -> FurtherCamera:
@@ -227,36 +230,36 @@ class Station:
         return FurtherCamera(name, cast(Camera, self.device(name)), section, calibration)
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The scanner of this name, or the rig's only one. Raises ConfigurationError or DeviceError."""
+        """Return the scanner of this name, or the rig's only one. Raises ConfigurationError or DeviceError."""
         return cast(Scanner, self.device(name or self._only("scanner")))
 
     def ct(self) -> CtSource:
-        """The rig's only CT source. Raises ConfigurationError unless there is exactly one, DeviceError."""
+        """Return the rig's only CT source. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(CtSource, self.device(self._only("ct")))
 
     def lightbox(self) -> Lightbox | None:
-        """The rig's light box, or None. Raises DeviceError."""
+        """Return the rig's light box, or None. Raises DeviceError."""
         names = self._of_kind("lightbox")
         return cast(Lightbox, self.device(names[0])) if names else None
 
     def layout(self, station: str) -> StationLayout:
-        """The layout of a station in the rig file. Raises ConfigurationError if there is no such station."""
+        """Return the layout of a station in the rig file. Raises ConfigurationError if there is no such station."""
         return layout_of(self.rig, station)
 
     def nominal_T_flange_camera(self) -> Transform:
-        """T_flange_camera (4, 4) in metres from the mount's drawing. Raises ConfigurationError without one."""
+        """Return T_flange_camera (4, 4) in metres from the mount's drawing. Raises ConfigurationError without one."""
         return self.rig.nominal_T_flange_camera()
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
-        """The arm's surroundings and the lens's optics in the rig file."""
+        """Return the arm's surroundings and the lens's optics in the rig file."""
         return self.rig.section.collision, self.rig.section.optics
 
     def lens(self) -> LensSection | None:
-        """Focal length and sensor in the rig file, or None."""
+        """Return focal length and sensor in the rig file, or None."""
         return self.rig.section.lens
 
     def imported(self) -> ImportList | None:
-        """The file list of an import, or None for a run that captures."""
+        """Return the file list of an import, or None for a run that captures."""
         return self.rig.section.imported
 
     def reopen(self, device: Device) -> None:
@@ -273,7 +276,7 @@ class Station:
         self._open[name] = device
 
     def hold_arms(self) -> None:
-        """Stop and close every open arm, which is told a leave once only; a dead link holds none of this up."""
+        """Stop and close every open arm, which gets a leave once only; a dead link delays none of this."""
         for name in self.opened("robot"):
             arm = cast(RobotArm, self._open.pop(name))
             with suppress(OrthocaptureError):
@@ -282,7 +285,7 @@ class Station:
             self._unlock(name)
 
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
-        """The connections to arms that have ended since the last call, in order."""
+        """Return the connections to arms that have ended since the last call, in order."""
         ended: list[ConnectionEnd] = []
         while self._ended:
             ended.append(self._ended.popleft())
@@ -315,11 +318,11 @@ class Station:
     # --- building ---
 
     def kind_of(self, name: str) -> str:
-        """The kind of a device: robot, camera, scanner, ct or lightbox."""
+        """Return the kind of a device: robot, camera, scanner, ct or lightbox."""
         return self._spec(name)[0].kind
 
     def abandoned(self, name: str) -> Abandoned | None:
-        """What becomes of a motion of this device whose program died, by its section of the rig file."""
+        """Return what becomes of a motion of this device whose program died, by its section of the rig file."""
         return self._config(name, self._spec(name)[0]).abandoned
 
     def _of_kind(self, kind: str) -> list[str]:
@@ -379,7 +382,7 @@ class Station:
 
 
 def _secrets_of(config: DriverConfig) -> Secrets:
-    """What a device's section of the rig file tells of the site, and the names of files where it exports."""
+    """Return what a device's section of the rig file says of the site, and the names of files where it exports."""
     settings = {field: str(value) for field, value in config.model_dump().items() if isinstance(value, str | Path)}
     addresses = [value for field, value in settings.items() if field in _PLACE_FIELDS]
     folder = Path(settings["folder"]) if settings.get("folder") else None
@@ -392,12 +395,12 @@ def _secrets_of(config: DriverConfig) -> Secrets:
 
 
 def _words_of(error: DeviceError) -> str:
-    """What is wrong and what to do, without where: that names a place of this site."""
+    """Return what is wrong and what to do, without where: that names a place of this site."""
     return f"{error.what}. {error.remedy}" if error.remedy else error.what
 
 
 def _one_name(field: str, address: str) -> str:
-    """A device's address in one form, however it was written: the port behind a link, the IP address of a host."""
+    """Return a device's address in one format, however it was written: a link's port, a host's IP address."""
     if field == "port":
         return address if ":" in address else os.path.realpath(address)
     if field != "host":
@@ -418,7 +421,7 @@ def devices_of(rig: Rig) -> dict[str, RigDevice]:
 
 
 def layout_of(rig: Rig, station: str) -> StationLayout:
-    """The layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
+    """Return the layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
     section = rig.section.stations.get(station)
     if section is None:
         known = ", ".join(rig.section.stations) or "none"
@@ -437,6 +440,6 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
 
 
 def _is_arm(driver: object) -> bool:
-    """Whether a driver is of an arm, not of other axes; also of a missing one, which opening the device names."""
+    """Return whether a driver is of an arm, not of other axes; true for a missing one, which opening reports."""
     point = _installed().get(driver) if isinstance(driver, str) else None
     return point is None or cast(DriverSpec, point.load()).is_arm

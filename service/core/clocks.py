@@ -23,11 +23,11 @@ class ClockOffset:
     """The mean offset of a further camera's clock.
 
     Attributes:
-        offset_s: of the further camera's clock minus the first one's.
-        sigma_s: of the mean: by the scatter of the photographs, or by the resolution of their times if that is more;
-            for cameras of two models, with what their delays may differ by.
-        photographs: pairs of them that state their times alike.
-        unlike: whether the cameras are of two models.
+        offset_s: the further camera's clock minus the first one's.
+        sigma_s: the standard deviation of the mean, by the scatter of the photographs, or by the resolution of their
+            times if that is more; for cameras of two models it includes what their delays may differ by.
+        photographs: the number of pairs of photographs whose times are recorded alike.
+        unlike: true if the cameras are of two models.
     """
 
     offset_s: float
@@ -37,10 +37,10 @@ class ClockOffset:
 
 
 def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOffset | None:
-    """The offset of a further camera's clock from the first one's; None if no two photographs state their times.
+    """Return the offset of a further camera's clock from the first one's; None if no photographs have times.
 
-    Between the two exposures at a viewpoint the host's clock tells how much time passed. What the time that both
-    photographs state differs from that is the offset. A difference between the cameras' delays, from the command to
+    Between the two exposures at a viewpoint the host's clock says how much time passed. What the times in both
+    photographs differ from that is the offset. A difference between the cameras' delays, from the command to
     the exposure, is part of it. Two bodies of one model have the same delay. Those of two models may differ by some
     tenths of a second, which no number of photographs averages out.
     """
@@ -57,7 +57,7 @@ def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOff
 
 
 def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[float, float] | None:
-    """Offset and resolution of the stated times, in seconds."""
+    """Return offset and resolution of the recorded times, in seconds."""
     first, second = (_time(recorded_optics(camera).exif_time) for camera in (capture.camera, exposure.camera))
     if first is None or second is None or (first[0].tzinfo is None) != (second[0].tzinfo is None):
         return None
@@ -66,7 +66,7 @@ def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[flo
 
 
 def _time(stated: str) -> tuple[datetime, float] | None:
-    """The time that a photograph states, and its resolution in seconds."""
+    """Parse the time in a photograph's EXIF; return it and its resolution in seconds."""
     for form in _FORMS:
         try:
             found = datetime.strptime(stated, form)  # noqa: DTZ007 - compared only with one that has no zone either
@@ -96,10 +96,10 @@ class ClockReading:
         device: name in rig.yaml, or "host".
         against: the clock it was compared with. For a device that counts from power-on only the change of the offset
             since the device was opened is given.
-        offset_s: how far it is ahead; None if not known.
+        offset_s: its lead over the other clock; None if not known.
         limit_s: largest acceptable absolute offset.
-        at_utc: when it was compared.
-        note: what else is known about it.
+        at_utc: the time of the comparison.
+        note: anything else that is known about the offset.
     """
 
     device: str
@@ -111,30 +111,30 @@ class ClockReading:
 
     @property
     def within(self) -> bool | None:
-        """Whether the offset is within its limit; None if the offset is not known."""
+        """True if the offset is within its limit; None if the offset is not known."""
         return None if self.offset_s is None else abs(self.offset_s) <= self.limit_s
 
     @property
     def name(self) -> str:
-        """Whose clock it is, in words."""
+        """The name of the clock's owner, for people."""
         return "this machine" if self.device == "host" else self.device
 
     @property
     def other(self) -> str:
-        """What it was compared with, in words."""
+        """The name of the clock that it was compared with, for people."""
         others = {"host UTC": "this machine", "NTP": "the network's time", "first camera": "the first camera"}
         return others.get(self.against, "this machine, its change")
 
     @property
     def difference(self) -> str:
-        """The offset in words, such as `1.250 s behind`; "–" if it is not known."""
+        """The offset as text, such as `1.250 s behind`; "–" if it is not known."""
         if self.offset_s is None:
             return "–"
         return f"{abs(self.offset_s):.3f} s {'ahead' if self.offset_s > 0 else 'behind'}"
 
     @property
     def meaning(self) -> str:
-        """What the offset means and what depends on it, for the auditor of a run."""
+        """The meaning of the offset and what depends on it, for the auditor of a run."""
         if self.against == "NTP":
             return "Every time in the record is from this machine's clock and is as true as this clock"
         if self.against == "first camera":
@@ -158,7 +158,7 @@ class ClockReading:
 
 
 def clock_offset_words(offset_s: float | None, clock: Literal["utc", "uptime"]) -> str:
-    """The clock offset in words that a device reported when it was opened."""
+    """Return as text the clock offset that a device reported when it was opened."""
     if clock == "uptime":
         return "counts from when it was switched on: only its drift matters"
     if offset_s is None:
@@ -167,7 +167,7 @@ def clock_offset_words(offset_s: float | None, clock: Literal["utc", "uptime"]) 
 
 
 def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
-    """The newest reading of every clock in a run's record: the host's first, then devices in the order of opening."""
+    """Return the newest reading of every clock in a run: the host's first, then devices as they were opened."""
     host: list[ClockReading] = []
     opened: dict[str, Event] = {}
     # Only the first image since a device was last opened, and the newest: a run may have ten thousand.
@@ -204,7 +204,7 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
 
 
 def _against_the_first(device: str, captures: Sequence[ViewpointCaptured], at_utc: str) -> list[ClockReading]:
-    """How far a further camera's clock is ahead of the first camera's, by the newest photographs."""
+    """Return how far a further camera's clock is ahead of the first camera's, by the newest photographs."""
     found = clock_offset(captures, device)
     if found is None:
         return []
@@ -222,7 +222,7 @@ def _report(opened: Event) -> RecordedReport:
 def _readings(
     name: str, opened: Event, report: RecordedReport, captures: tuple[Event, Event] | None
 ) -> list[ClockReading]:
-    """The readings of one device from its last opening and the first and newest image since."""
+    """Return the readings of one device from its last opening and the first and newest image since."""
     if report.clock == "uptime":
         return [_drift(name, opened, captures)]
     offset_s, at_utc = report.clock_offset_s, opened.at_utc
@@ -247,7 +247,7 @@ def _drift(name: str, opened: Event, captures: tuple[Event, Event] | None) -> Cl
 
 
 def _exif_offset_s(event: Event) -> float | None:
-    """Camera clock minus host UTC at the release, in seconds; None if EXIF lacks the offset from UTC."""
+    """Return the camera's clock minus host UTC at the release, in seconds; None if EXIF has no offset from UTC."""
     payload = event.payload
     assert isinstance(payload, ViewpointCaptured)
     try:

@@ -15,11 +15,11 @@ from service.core.loading import loading
 
 
 class DeclaredKind(Protocol):
-    """What every kind has."""
+    """The least that every kind has."""
 
     @property
     def name(self) -> str:
-        """In protocols and records."""
+        """The kind's name in protocols and records."""
         ...
 
 
@@ -27,11 +27,11 @@ K = TypeVar("K", bound=DeclaredKind)
 
 
 def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
-    """The kinds of this type by name: KIND or KINDS of every module below `package`, and those of entry points.
+    """Return the kinds of this type by name: KIND or KINDS of each module below `package`, and those of entry points.
 
     Args:
-        package: name of the package, at any depth of which modules are looked for, or of one module.
-        group: of the entry points, each of which names a kind.
+        package: the name of a package, whose modules are searched at any depth, or of one module.
+        group: the group of entry points, each of which names a kind.
         kind: the type of what is declared.
 
     Raises:
@@ -52,7 +52,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
 
 
 def plug_ins(group: str) -> tuple[EntryPoint, ...]:
-    """The entry points of one of our groups, by name; the installed packages are searched once for all groups."""
+    """Return the entry points of one of our groups, by name; installed packages are searched once for all groups."""
     return _plug_ins(tuple(sys.path)).get(group, ())
 
 
@@ -78,7 +78,7 @@ class KindsOnDemand(Mapping[str, K]):
     """
 
     def __init__(self, package: str, group: str, kind: type[K], order: Callable[[K], Any]) -> None:
-        """As for `declared_kinds`; the kinds are listed by `order`. Raises ConfigurationError, as a listing does."""
+        """Take the arguments of `declared_kinds`, and `order`, which sorts kinds. Raises ConfigurationError."""
         self._package, self._group, self._kind, self._order = package, group, kind, order
         self._modules = {name.rpartition(".")[2]: name for name in _modules(package)}
         self._all: dict[str, K] | None = None
@@ -107,13 +107,13 @@ class KindsOnDemand(Mapping[str, K]):
 
 
 def kind_named(name: str, known: Mapping[str, K], *, what: str, option: str) -> K:
-    """The kind of this name.
+    """Return the kind of this name.
 
     Args:
-        name: as it was typed.
+        name: the name that was typed.
         known: the kinds by name.
-        what: a kind in words, such as `format`.
-        option: of the command line, at which the name was given.
+        what: the noun for such a kind, such as `format`.
+        option: the command line's option at which the name was given.
 
     Raises:
         ConfigurationError: there is none of this name.

@@ -1,6 +1,6 @@
 """Forecast whether the disk has room for a run, from what is planned and what was written. Pure.
 
-The last LEAST_FREE_BYTES are kept for the evidence: no logs and no new photographs are written into them.
+The last LEAST_FREE_BYTES are reserved for the evidence: no logs and no new photographs are written into them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run will still write, and what is free."""
+    """The bytes that a run will still write, and those that are free."""
 
     views_left: int
     view_bytes: int  # one view, with what is computed from it
@@ -46,7 +46,7 @@ class Forecast:
 
     @property
     def stop_below_bytes(self) -> int:
-        """Free space below which no further photograph is begun."""
+        """Free space below which no further photograph is started."""
         return LEAST_FREE_BYTES + _VIEWS_UNDER_WAY * self.view_bytes
 
     @property
@@ -78,7 +78,7 @@ class Forecast:
 
     @property
     def reserve(self) -> str:
-        """What is kept free, in words."""
+        """One sentence on the space that stays free."""
         return f"the last {size_words(LEAST_FREE_BYTES)} are kept free, so that work under way can be recorded"
 
 
@@ -90,10 +90,10 @@ def forecast(
     Args:
         protocol: the run's protocol.
         state: the run's state; None before it begins.
-        here: sizes of its files so far.
-        before: sizes of all files of an earlier run of the same protocol; None if there was none.
+        here: the sizes of its files so far.
+        state: the run's state; None before it begins.
         free_bytes: free space on the disk of the data folder.
-        simulated: whether the rig is simulated.
+        simulated: true for a simulated rig.
     """
     known = before if before is not None and before.views >= _ENOUGH_VIEWS else None
     own = here if here.views >= _ENOUGH_VIEWS else None
@@ -116,7 +116,7 @@ def forecast(
 
 
 def views_left(protocol: Protocol, state: RunState | None) -> int:
-    """Number of photographs that the protocol plans and that are not taken yet."""
+    """Return the number of photographs that the protocol plans and that are not taken yet."""
     left = 0
     for step in protocol.steps:
         now = None if state is None else state.steps[step.id]
@@ -128,5 +128,5 @@ def views_left(protocol: Protocol, state: RunState | None) -> int:
 
 
 def size_words(size_bytes: float) -> str:
-    """A size in words, such as `850 MB` or `12.3 GB`."""
+    """Return a size as text, such as `850 MB` or `12.3 GB`."""
     return f"{gigabytes(size_bytes):.1f} GB" if size_bytes >= 1e9 else f"{megabytes(size_bytes):.0f} MB"

@@ -29,12 +29,12 @@ from service.core.run.state_transitions import change
 
 
 def schema_text(params_models: Mapping[str, type[StepParams]]) -> str:
-    """The text of docs/reference/protocol.schema.json; `params_models` maps each step kind to its Params."""
+    """Return the text of docs/reference/protocol.schema.json; `params_models` maps each step kind to its Params."""
     return json.dumps(protocol_json_schema(params_models), indent=2, ensure_ascii=False) + "\n"
 
 
 def lifecycle_text(protocol: Protocol) -> str:
-    """A Markdown page: a protocol's state machine, the phases of a step, and a table of the steps."""
+    """Return a Markdown page: a protocol's state machine, the phases of a step, and a table of the steps."""
     yes = {True: "yes", False: ""}
     rows = [
         f"| {step.id} | {step.kind} | {step.title} | {yes[step.sign]} | {yes[step.skippable]} "
@@ -72,13 +72,13 @@ def lifecycle_text(protocol: Protocol) -> str:
 
 
 def run_diagram(steps: Iterable[Step]) -> list[str]:
-    """Lines of a Mermaid diagram: the steps in order inside the run, with pause and end around it."""
+    """Return the lines of a Mermaid diagram: the steps in order inside the run, with pause and end around it."""
     known = {step.id: step for step in steps}
     inside, around = dict[str, None](), dict[str, None]()  # ordered sets
     for trigger, source, target in transition_table(tuple(known)):
         origin, end = source.split(SEPARATOR)[0], target.split(SEPARATOR)[0]
         if trigger.startswith("redo_") or origin == end:
-            continue  # redo arrows from every step would hide the rest; the page says it in words
+            continue  # redo arrows from every step would hide the rest; the page says it in a sentence
         if origin in known and end in known:
             inside[f"        {origin} --> {end}: {trigger}"] = None
         elif not (origin == PAUSED and end == COMPLETED):
@@ -98,7 +98,7 @@ def run_diagram(steps: Iterable[Step]) -> list[str]:
 
 
 def step_diagram() -> list[str]:
-    """Lines of a Mermaid diagram: the phases of a step."""
+    """Return the lines of a Mermaid diagram: the phases of a step."""
     return [
         "stateDiagram-v2",
         f"    [*] --> {PHASES[0]}",
@@ -129,7 +129,7 @@ _BEGAN, _ENDED = "2026-01-01T08:00:00Z", "2026-01-01T08:05:00Z"
 
 
 def ways_text(protocol: Protocol) -> str:
-    """A Markdown page of choices by step kind and failure, with cost and loss, for the first step of each kind."""
+    """Return a Markdown page of choices by step kind and failure, with cost and loss, for each kind's first step."""
     shown: dict[str, Step] = {}
     for step in protocol.steps:
         shown.setdefault(step.kind, step)
@@ -218,7 +218,7 @@ def _failed(gate: Gate) -> GateVerdict:
 
 
 def _at(protocol: Protocol, step: Step, phase: Literal["ready", "recovering"]) -> RunState:
-    """The state of a run that is at `step`, with every earlier step passed."""
+    """Return the state of a run that is at `step`, with every earlier step passed."""
     steps = {
         s.id: StepState(
             s.id,

@@ -13,9 +13,9 @@ class OrthocaptureError(Exception):
     """Base of all errors of this project.
 
     Args:
-        what: what is wrong, one sentence without a full stop.
+        what: the fault in one sentence without a full stop.
         where: the file, line, field, device or record concerned.
-        remedy: what the reader should do about it.
+        remedy: the advice to the reader.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
@@ -35,12 +35,12 @@ class OrthocaptureError(Exception):
 
 
 def what_of(text: str) -> str:
-    """What is wrong, from the recorded text of an error: without the place and the remedy."""
+    """Return the fault from the recorded text of an error, without the place and the remedy."""
     return text.split(" [", maxsplit=1)[0].split(". ", maxsplit=1)[0].rstrip(".")
 
 
 def printable(text: str) -> str:
-    """A text that can be printed and recorded: with escapes for what a terminal would obey, and not too long."""
+    """Return a text to print and record: not too long, and with escapes for what a terminal would obey."""
     return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in shown_lines(text).split("\n")), _LONGEST)
 
 

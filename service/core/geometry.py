@@ -24,14 +24,14 @@ def transform(rotation: Array | Rotation, translation_m: Array) -> Transform:
 
 
 def _rotations() -> type[Rotation]:
-    """SciPy's rotations, imported on first use: half a second, which most commands do without."""
+    """Import SciPy's rotations on first use: it takes half a second, which most commands do without."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     return Rotation
 
 
 def inverse(T_a_b: Transform) -> Transform:
-    """T_b_a (4, 4), from the transposed rotation, so that it stays exactly rigid."""
+    """Return T_b_a (4, 4), from the transposed rotation, so that it stays exactly rigid."""
     R = T_a_b[:3, :3]
     return transform(R.T, -R.T @ T_a_b[:3, 3])
 
@@ -42,14 +42,14 @@ def apply(T_a_b: Transform, points_b: Array) -> Array:
 
 
 def from_rotation_vector(pose: Array) -> Transform:
-    """T_a_b from a Universal Robots pose: (6,) x, y, z in metres and rotation vector in radians."""
+    """Return T_a_b from a Universal Robots pose: (6,) x, y, z in metres and rotation vector in radians."""
     x, y, z, *turn = pose.tolist()
     (a, b, c), (d, e, f), (g, h, i) = _rotation(*turn)
     return np.array([[a, b, c, x], [d, e, f, y], [g, h, i, z], [0.0, 0.0, 0.0, 1.0]])
 
 
 def _rotation(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
-    """The rows of the matrix of a rotation vector, by way of its unit quaternion; not a number unless it is finite.
+    """Return the matrix rows of a rotation vector, by way of its unit quaternion; not a number unless it is finite.
 
     In plain floats: SciPy's conversion takes ten times as long for a single vector, and an arm sends 125 a second.
     """
@@ -73,17 +73,17 @@ def _rotation(x: float, y: float, z: float) -> tuple[tuple[float, float, float],
 
 
 def to_rotation_vector(T_a_b: Transform) -> Array:
-    """The (6,) pose x, y, z in metres and rotation vector in radians of T_a_b."""
+    """Return the (6,) pose x, y, z in metres and rotation vector in radians of T_a_b."""
     return np.concatenate([T_a_b[:3, 3], _rotations().from_matrix(T_a_b[:3, :3]).as_rotvec()])
 
 
 def from_quaternion(translation_m: Array, quaternion_xyzw: Array) -> Transform:
-    """T_a_b from (3,) position and (4,) scalar-last quaternion."""
+    """Return T_a_b from (3,) position and (4,) scalar-last quaternion."""
     return transform(_rotations().from_quat(quaternion_xyzw), translation_m)
 
 
 def skew(v: Array) -> Array:
-    """(..., 3, 3) cross-product matrices of vectors (..., 3)."""
+    """Return (..., 3, 3) cross-product matrices of vectors (..., 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
@@ -92,17 +92,17 @@ def skew(v: Array) -> Array:
 
 
 def increment(T: Transform, d: Array, w: Array) -> Transform:
-    """exp(w) R, t + d: the project's pose perturbation, in the axes of the outer frame."""
+    """Return exp(w) R, t + d: the project's pose perturbation, in the axes of the outer frame."""
     return transform(_rotations().from_rotvec(w).as_matrix() @ T[:3, :3], T[:3, 3] + d)
 
 
 def place_jacobian(turned: Array) -> Array:
-    """(n, 3, 6) derivative of points by (d, w) of a pose; `turned` (n, 3): points rotated, not translated."""
+    """Return (n, 3, 6) derivative of points by (d, w) of a pose; `turned` (n, 3): points rotated, not translated."""
     return np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Transform:
-    """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
+    """Return T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -110,7 +110,7 @@ def look_at(eye: Array, target: Array, up: Array) -> Transform:
 
 
 def rotation_angle_rad(T: Transform) -> float:
-    """Angle of the rotation part in radians, 0 to pi."""
+    """Return the angle of the rotation part in radians, 0 to pi."""
     return float(_rotations().from_matrix(T[:3, :3]).magnitude())
 
 

@@ -21,18 +21,18 @@ from service.core.run.state import JobState, RunState, StepState
 
 
 def arguments_name(arguments: Mapping[str, Any]) -> str:
-    """A hash of the arguments, 16 hexadecimal digits: equal arguments have the same name."""
+    """Return a hash of the arguments, 16 hexadecimal digits: equal arguments have the same name."""
     return hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def key_stem(state: RunState, step: str, kind: str) -> str:
-    """The common prefix of the keys of all jobs of this kind that were enqueued since the step's last redo."""
+    """Return the common prefix of the keys of all jobs of this kind that were enqueued since the step's last redo."""
     generation = sum(past.step == step and past.viewpoint is None for past in state.superseded)
     return f"{step}/{generation}/{kind}/"
 
 
 def job_key(state: RunState, step: str, kind: str, name: str) -> str:
-    """The key under which a job would be enqueued now.
+    """Return the key under which a job would be enqueued now.
 
     A redo of the step begins a new generation of keys; a failed job is tried again under a new key.
     """
@@ -42,7 +42,7 @@ def job_key(state: RunState, step: str, kind: str, name: str) -> str:
 
 
 def newest_job(state: RunState, step: str, kind: str, name: str) -> JobState | None:
-    """The last job for this work enqueued since the step's last redo, or None."""
+    """Return the last job for this work enqueued since the step's last redo, or None."""
     stem = f"{key_stem(state, step, kind)}{name}/"
     jobs = [job for job in state.steps[step].jobs.values() if job.idempotency_key.startswith(stem)]
     return max(jobs, key=lambda job: job.enqueued_seq, default=None)
@@ -58,7 +58,7 @@ class Reference:
     """A part of an earlier job's answer.
 
     Attributes:
-        job: id of the job.
+        job: the job's id.
         field: keys and indices down to the part, separated by `/`, from `measures`, `artefacts` or `result`; `*`
             stands for every item of a list (`result/details/spheres/*/covariance_m2`).
     """
@@ -67,7 +67,7 @@ class Reference:
     field: str
 
     def record(self) -> dict[str, Any]:
-        """The reference as it stands in a job's arguments."""
+        """Return the reference as it stands in a job's arguments."""
         return {FROM: {"job": self.job, "field": self.field}}
 
 
@@ -79,9 +79,9 @@ class Each:
 
     Attributes:
         jobs: prefixes of the jobs' keys (`step/generation/kind/`); the answers follow in the order of these prefixes.
-        upto_seq: only jobs that had finished by this event count.
-        field: as in `Reference`.
-        without: ids of jobs to leave out, such as those of images that were taken again.
+        upto_seq: the event by which jobs must have finished to count.
+        field: the field of each answer, as in `Reference`.
+        without: the ids of jobs to leave out, such as those of images that were taken again.
     """
 
     jobs: tuple[str, ...]
@@ -90,12 +90,12 @@ class Each:
     without: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:
-        """The reference as it stands in a job's arguments."""
+        """Return the reference as it stands in a job's arguments."""
         fields = {"jobs": list(self.jobs), "upto_seq": self.upto_seq, "field": self.field}
         return {EACH: {**fields, "without": list(self.without)}}
 
     def members(self, jobs: Jobs) -> list[JobState]:
-        """The jobs that it stands for."""
+        """Return the jobs that it stands for."""
         without = frozenset(self.without)
         chosen = [
             job
@@ -110,12 +110,12 @@ class Each:
 
 
 def jobs_of(state: RunState) -> dict[str, JobState]:
-    """Every job of a run that still counts, by id."""
+    """Return every job of a run that still counts, by id."""
     return {name: job for step in state.steps.values() for name, job in step.jobs.items()}
 
 
 def read_reference(value: object) -> Reference | Each | None:
-    """The reference that a value of recorded arguments is; None for any other value."""
+    """Return the reference that a value of recorded arguments is; None for any other value."""
     # `dict` first: the test for a Mapping takes five times as long, and a record holds thousands of values.
     if not isinstance(value, dict | Mapping) or len(cast("Mapping[str, Any]", value)) != 1:
         return None
@@ -130,7 +130,7 @@ def read_reference(value: object) -> Reference | Each | None:
 
 
 def references_in(value: object) -> Iterator[Reference | Each]:
-    """Every reference anywhere within recorded arguments."""
+    """Yield every reference anywhere within recorded arguments."""
     found = read_reference(value)
     if found is not None:
         yield found
@@ -143,7 +143,7 @@ def references_in(value: object) -> Iterator[Reference | Each]:
 
 
 def resolve(value: Any, jobs: Jobs) -> Any:
-    """Recorded arguments with every reference replaced by the value it refers to.
+    """Return recorded arguments with every reference replaced by the value it refers to.
 
     Raises:
         IntegrityError: a job is not among `jobs`, has not finished, or its answer has no such part.
@@ -166,7 +166,7 @@ def resolve(value: Any, jobs: Jobs) -> Any:
 
 
 def part_of(job: JobState, field: str) -> Any:
-    """A part of a finished job's answer. Raises IntegrityError where it has none of this name."""
+    """Return a part of a finished job's answer. Raises IntegrityError where it has none of this name."""
     answer = {
         "measures": job.measures,
         "result": job.result,
@@ -189,7 +189,7 @@ def _walk(value: Any, path: Sequence[str]) -> Any:
 
 
 def computed_by(state: StepState) -> tuple[ComputedBy, ...]:
-    """The jobs whose figures a step reported as its own, as its event names them.
+    """Return the jobs whose figures a step reported as its own, as its event names them.
 
     Events of older versions do not name them; there, a job is recognised by the values that it shares with the step.
     """
@@ -197,7 +197,7 @@ def computed_by(state: StepState) -> tuple[ComputedBy, ...]:
 
 
 def answered_by(state: StepState) -> JobState | None:
-    """The newest job whose answer is part of the step's result; None if no job computed it."""
+    """Return the newest job whose answer is part of the step's result; None if no job computed it."""
     found = [state.jobs[source.job] for source in computed_by(state) if source.job in state.jobs]
     for job in sorted(found, key=lambda job: job.enqueued_seq, reverse=True):
         if job.result and job.result.keys() <= state.result.keys():
@@ -216,7 +216,7 @@ def _by_values(state: StepState) -> Iterator[ComputedBy]:
 
 
 def _prefix(state: StepState, job: JobState) -> str | None:
-    """What stands before the names of the job's measures in the step's; None if these are not its measures."""
+    """Return what precedes the job's names of measures in the step's; None if these are not the job's measures."""
     first = next(iter(job.measures), None)
     if first is None:
         return None

@@ -23,7 +23,7 @@ from service.core.picture_files import JPEG_BEGINS, end_of_jpeg
 
 _ALLOWED_S, _ALLOWED_S_A_FILE = 60.0, 20.0
 _FILE = re.compile(r"^decoding file (\d+)$", re.MULTILINE)
-# libjpeg's words, in each of its versions; others, such as of an unknown revision of JFIF, are no damage.
+# libjpeg's messages, in each of its versions; others, such as of an unknown revision of JFIF, are no damage.
 _DAMAGE = re.compile(
     r"^(?:Corrupt JPEG data: (?P<what>.*)|(?P<other>Inconsistent progression.*|Invalid SOS.*|Premature end.*))$",
     re.MULTILINE,
@@ -32,7 +32,7 @@ _SPARE = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 
 
 def damaged_jpegs(files: Sequence[Path]) -> dict[Path, str]:
-    """The damaged ones of JPEG files that are complete, with the decoder's words.
+    """Return the damaged ones of complete JPEG files, with the decoder's messages.
 
     Files of other kinds are passed over. A file with which the decoder ends, or does not end, is a damaged one too.
     """
@@ -40,7 +40,7 @@ def damaged_jpegs(files: Sequence[Path]) -> dict[Path, str]:
     left = list(files)
     while left:
         said, end = _decoded(left)
-        parts = _FILE.split(said)[1:]  # number, words, number, words, …
+        parts = _FILE.split(said)[1:]  # number, text, number, text, …
         begun = [(left[int(number)], words) for number, words in zip(parts[::2], parts[1::2], strict=True)]
         for file, words in begun:
             damage = _DAMAGE.search(words)
@@ -56,7 +56,7 @@ def damaged_jpegs(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def _decoded(files: Sequence[Path]) -> tuple[str, str]:
-    """What the decoder said of the files, and why it ended before the last one; "" if it did not."""
+    """Return what the decoder said of the files, and why it ended before the last one; "" if it did not."""
     names = b"\0".join(os.fsencode(file) for file in files)
     allowed_s = _ALLOWED_S + _ALLOWED_S_A_FILE * len(files)
     try:
@@ -75,7 +75,7 @@ def _decoded(files: Sequence[Path]) -> tuple[str, str]:
 
 
 def _is_padding(file: Path, what: str) -> bool:
-    """Whether the decoder warns of nothing but equal bytes with which a camera filled up the end of the picture."""
+    """Return whether the decoder only warns of equal bytes with which a camera filled up the end of the picture."""
     spare = _SPARE.fullmatch(what)
     if spare is None:
         return False

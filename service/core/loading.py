@@ -27,7 +27,7 @@ def end_loading() -> None:
 @contextmanager
 def loading() -> Generator[None]:
     """Import many modules inside this, once in a process: what exists then is never collected."""
-    if not gc.isenabled():  # whoever has begun it will end it
+    if not gc.isenabled():  # whoever started it will end it
         yield
         return
     begin_loading()

@@ -61,7 +61,7 @@ class ForeignKindError(DataError):
 
 
 def kind_of(data: bytes) -> str:
-    """What a file is by its first bytes: JPEG, PNG, WebP, HEIC, …; "" if that is not known."""
+    """Return a file's kind by its first bytes: JPEG, PNG, WebP, HEIC, …; "" if it is not known."""
     if data[:4] == b"RIFF":
         return {b"WEBP": "WebP", b"AVI ": "video"}.get(data[8:12], "")
     if data[4:8] == b"ftyp":
@@ -75,7 +75,7 @@ def kind_of(data: bytes) -> str:
 
 
 def another_kind(kind: str, wanted: str, where: str) -> ForeignKindError:
-    """The error for a file of this kind, as `kind_of` names it, where only the wanted ones are read."""
+    """Return the error for a file of this kind, as `kind_of` names it, where only the wanted ones are read."""
     return ForeignKindError(
         f"this is {_article(kind)} {kind}{'' if kind in _NO_PICTURES else ' picture'}, not {wanted}",
         where=where,
@@ -117,20 +117,20 @@ def check_jpeg(data: bytes, where: str) -> None:
 
 
 def end_of_jpeg(data: bytes, where: str) -> int:
-    """Length of a JPEG's picture: cameras append previews, with metadata of their own, after it.
+    """Return the length in bytes of a JPEG's picture; cameras append previews, with metadata of their own, after it.
 
     Raises:
-        DataError: as `check_jpeg`.
+        DataError: the data are no whole JPEG (`check_jpeg`).
     """
     check_jpeg(data, where)
     return next(at + 2 for marker, at in _segments(data, where) if marker == _END_OF_IMAGE)
 
 
 def without_metadata(data: bytes, where: str) -> bytes:
-    """A JPEG without EXIF, XMP, IPTC and comments, broken or not. Its colour profile stays, and each of its pixels.
+    """Return a JPEG, broken or not, without EXIF, XMP, IPTC and comments, and with its colour profile and all pixels.
 
     Raises:
-        DataError: as `check_jpeg`.
+        DataError: the data are no whole JPEG (`check_jpeg`).
     """
     end = end_of_jpeg(data, where)
     kept, begin = bytearray(), 0
@@ -177,7 +177,7 @@ def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
     """Check a JPEG, PNG or WebP without decoding it, and no other format. `partly` accepts a truncated JPEG.
 
     Raises:
-        DataError: as `check_jpeg` and `check_png`.
+        DataError: the picture is damaged (`check_jpeg`, `check_png`).
     """
     if data.startswith(PNG_BEGINS):
         check_png(data, where)
@@ -188,7 +188,7 @@ def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
 
 
 def picture_size(data: bytes, where: str = "its first bytes") -> tuple[int, int]:
-    """Width and height of a JPEG or PNG in pixels as stored, from its header; the rest may be missing.
+    """Return width and height of a JPEG or PNG in pixels as stored, from its header; the rest may be missing.
 
     Raises:
         DataError: it is neither, or its header is damaged or missing.
@@ -230,7 +230,7 @@ def _segments(data: bytes, where: str) -> Iterator[tuple[int, int]]:
 
 
 def _frame_size(data: bytes, at: int) -> tuple[int, int]:
-    """Width and height of a frame header that begins at `at`."""
+    """Return width and height of a frame header that begins at `at`."""
     return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
 
 

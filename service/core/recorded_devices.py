@@ -16,7 +16,7 @@ Plain = Mapping[str, object]
 
 @dataclass(frozen=True, slots=True)
 class RecordedIdentity:
-    """The device that answered when it was opened (drivers.interfaces.DeviceIdentity); "" where it was not stated."""
+    """The device that answered when it was opened (drivers.interfaces.DeviceIdentity); "" where it was not given."""
 
     kind: str = ""  # robot, camera, scanner, ct, lightbox
     model: str = ""
@@ -35,7 +35,7 @@ class RecordedReport:
         identity: the device.
         clock_offset_s: device clock minus host UTC, or minus host monotonic for an uptime clock; None: not reported.
         clock: uptime: it counts from power-on. Old records do not say; there the kind of device decides.
-        details: what else it says of itself, by name.
+        details: further statements of the device about itself, by name.
     """
 
     identity: RecordedIdentity
@@ -46,7 +46,7 @@ class RecordedReport:
 
 @dataclass(frozen=True, slots=True)
 class RecordedOptics:
-    """Camera, lens and settings that a photograph states (the field `camera` of a View); "" or None: not stated."""
+    """Camera, lens and settings in a photograph's EXIF (the field `camera` of a View); "" or None: not given."""
 
     model: str = ""
     body_serial: str = ""
@@ -59,7 +59,7 @@ class RecordedOptics:
 
 
 def recorded_identity(stated: object) -> RecordedIdentity:
-    """The identity in a recorded DeviceReport; all fields are "" if there is none."""
+    """Return the identity in a recorded DeviceReport; all fields are "" if there is none."""
     fields = _mapping(stated)
     return RecordedIdentity(
         kind=_text(fields.get("kind")),
@@ -73,7 +73,7 @@ def recorded_identity(stated: object) -> RecordedIdentity:
 
 
 def recorded_report(report: object) -> RecordedReport:
-    """The `report` of a device_opened event."""
+    """Return the `report` of a device_opened event."""
     fields = _mapping(report)
     identity = recorded_identity(fields.get("identity"))
     stated = fields.get("clock") or ("uptime" if identity.kind == "robot" else "utc")
@@ -83,7 +83,7 @@ def recorded_report(report: object) -> RecordedReport:
 
 
 def recorded_optics(camera: object) -> RecordedOptics:
-    """The `camera` of a view's event. Zero stands for a length or f-number that the camera does not know."""
+    """Return the `camera` of a view's event. Zero stands for a length or f-number that the camera does not know."""
     fields = _mapping(camera)
     return RecordedOptics(
         model=_text(fields.get("model")),
@@ -114,16 +114,16 @@ class CameraBodies:
     """The serial numbers of a run's cameras.
 
     Attributes:
-        wires: serial number that a camera states over its connection → device name in rig.yaml. Over USB a camera may
-            put digits of its model before those of the body.
-        stated: the distinct serial numbers that the photographs state.
+        wires: the device's name in rig.yaml, by the serial number that a camera sends over its connection. Over USB a
+            camera may put digits of its model before those of the body.
+        stated: the distinct serial numbers in the photographs.
     """
 
     wires: Mapping[str, str]
     stated: tuple[str, ...]
 
     def shown(self, identity: RecordedIdentity) -> str:
-        """The serial number to show for a device: for a camera that of the body, as its photographs state it."""
+        """Return the serial number to show for a device: for a camera its body's, as its photographs state it."""
         return self._own(identity.serial) if identity.kind == "camera" else identity.serial
 
     def _own(self, wire: str) -> str:
@@ -131,7 +131,7 @@ class CameraBodies:
 
     @property
     def explained(self) -> tuple[str, ...]:
-        """One sentence for each camera that is shown under another number than it states over its connection."""
+        """One sentence for each camera that is shown under another number than it reports over its connection."""
         return tuple(
             f"The serial number of {device} is {self._own(wire)}, as every photograph of it states. Over its "
             f"connection it states {wire}, which ends with the same digits: it is one and the same body"
@@ -153,7 +153,7 @@ class CameraBodies:
 
 
 def bodies(events: Sequence[Event]) -> CameraBodies:
-    """The serial numbers in a run's events."""
+    """Return the serial numbers in a run's events."""
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
     views = (event.payload for event in events if isinstance(event.payload, RecordedView))
     identities = ((payload.device, recorded_report(payload.report).identity) for payload in opened)
@@ -161,11 +161,11 @@ def bodies(events: Sequence[Event]) -> CameraBodies:
 
 
 def bodies_of(identities: Iterable[tuple[str, RecordedIdentity]], stated: Iterable[str]) -> CameraBodies:
-    """The serial numbers of cameras.
+    """Return the serial numbers of cameras.
 
     Args:
         identities: (name in rig.yaml, identity in its DeviceReport) of each opened device.
-        stated: serial numbers in the photographs; "" is ignored.
+        stated: the serial numbers in the photographs; "" is ignored.
     """
     wires = {identity.serial: name for name, identity in identities if identity.kind == "camera"}
     return CameraBodies(wires, tuple(dict.fromkeys(number for number in stated if number)))
@@ -183,15 +183,15 @@ _DECIDES = frozenset({"confirm", "redo", "skip"})
 
 
 def exchanged(events: Iterable[Event], device: str, opened: RecordedIdentity) -> RecordedIdentity | None:
-    """The device that a run has used so far under this name in the rig file; None if it is the one opened now.
+    """Return the device that a run has used so far under this name in the rig file; None if it is the one opened now.
 
-    A device that states no serial number is told by its model. Another one is the run's own if it answers after
+    A device without a serial number is identified by its model. Another one is the run's own if it answers after
     a person who was asked about it has decided to go on.
 
     Args:
-        events: of the run, before this opening.
-        device: name in the rig file.
-        opened: what answered.
+        events: the run's events before this opening.
+        device: its name in the rig file.
+        opened: the device that answered.
     """
     own: RecordedIdentity | None = None
     other: RecordedIdentity | None = None  # that answered last, instead of it
@@ -219,7 +219,7 @@ def exchanged(events: Iterable[Event], device: str, opened: RecordedIdentity) ->
 
 
 def exchanged_words(device: str, before: RecordedIdentity, now: RecordedIdentity) -> str:
-    """`camera is another camera: it has the serial number 5678, the one before had 1234`."""
+    """Return `camera is another camera: it has the serial number 5678, the one before had 1234`."""
     if now.serial and before.serial:
         what = f"it has the serial number {now.serial}, the one before had {before.serial}"
     else:

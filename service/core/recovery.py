@@ -1,4 +1,4 @@
-"""What can be done about a failed step: the policy, the operator's choices with their time and loss, and words."""
+"""What can be done about a failed step: the policy, the operator's choices with their time, loss and text."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def recovery_policy(recovery: Recovery, error: str, failures: int, *, starved: b
 
     Args:
         recovery: the step's policy from the protocol.
-        error: class name of the error that ended the work.
-        failures: consecutive failures of the step, including this one (StepState.failures + 1).
+        error: the class name of the error that ended the work.
+        failures: the number of consecutive failures of the step, including this one (StepState.failures + 1).
         starved: the computer had no processor time for the work, which explains a device that was late.
     """
     if error in NEEDS_A_PERSON:
@@ -104,14 +104,14 @@ class WayOn:
     verb: OperatorVerb
     step: str  # the step concerned
     words: str
-    minutes: float | None  # how long it takes; None if not known in advance
-    loses: str  # what no longer counts afterwards, in words
+    minutes: float | None  # the time that it takes; None if not known in advance
+    loses: str  # a phrase on what no longer counts afterwards
     available: bool = True
     why_not: str = ""
 
 
 def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
-    """What stops the current step; None while nothing does."""
+    """Return the reason why the current step is stopped; None while nothing stops it."""
     if not state.started or state.terminal:
         return None
     if state.phase == "recovering" and not state.step.retry_granted:
@@ -122,7 +122,7 @@ def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
 
 
 def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
-    """Every way on for a stopped run, the available ones first; empty while nothing stops it.
+    """Return every way on for a stopped run, the available ones first; empty while nothing stops it.
 
     Ending the run is always available. It is the last of the available ones, unless the protocol recommends it
     (`on_failure: abort`).
@@ -149,31 +149,31 @@ def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
 
 
 def _changed(state: RunState) -> bool:
-    """Whether another device answers than the one that was calibrated: another try would not make it the same."""
+    """Return whether another device answers than the calibrated one: another try would not make it the same."""
     return state.step.failure is not None and state.step.failure.error == "DeviceChangedError"
 
 
 def planned_views(step: Step) -> int:
-    """Number of images that the protocol plans for a step."""
+    """Return the number of images that the protocol plans for a step."""
     return sum(int(one.count) for one in planned_sets(step))
 
 
 def planned_sets(step: Step) -> tuple[Any, ...]:
-    """A step's sets of viewpoints and the board poses that the software plans; each has `count` and `station`."""
+    """Return a step's sets of viewpoints and of planned board poses; each has `count` and `station`."""
     planned = getattr(step.params, "board_poses", None)
     listed: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
     return listed if planned is None else (*listed, planned)
 
 
 def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
-    """Seconds for one view: the median of this run's, else from the arm's plan; None if neither is known."""
+    """Return the seconds for one view: this run's median, else from the arm's plan; None if neither is known."""
     if state.view_gaps_s:
         return median(state.view_gaps_s)
     return state.steps[step.id].motion_plan.view_s
 
 
 def takes_words(minutes: float | None) -> str:
-    """A duration in words, such as `about 12 min`."""
+    """Return a duration as text, such as `about 12 min`."""
     if minutes is None:
         return "not known"
     if minutes == 0:
@@ -203,12 +203,12 @@ def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
 
 
 def _computing(worked_s: float | None, views: int, each_s: float | None) -> float | None:
-    """Minutes of computing after the views are taken: the work so far less the time for `views`."""
+    """Return the minutes of computing after the views are taken: the work so far less the time for `views`."""
     return None if worked_s is None or each_s is None else max(worked_s - views * each_s, each_s) / 60
 
 
 def _all_taken(step: Step, now: StepState) -> bool:
-    """Whether every planned view is taken and the step suggests no others: a retry would change no figure."""
+    """Return whether every planned view is taken and the step suggests no others: a retry would change no figure."""
     return now.mend is None and 0 < planned_views(step) <= len(now.captured)
 
 
@@ -289,7 +289,7 @@ def _end(protocol: Protocol, state: RunState) -> WayOn:
 
 
 def _took_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
-    """Seconds for doing a step: estimated from the time per view, else what it took in this run; None: not known."""
+    """Return the seconds for doing a step: estimated from the time per view, else what it took; None: not known."""
     now = state.steps[step.id]
     each_s, views = view_s(protocol, state, step), planned_views(step)
     if views and each_s is not None:

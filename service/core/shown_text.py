@@ -22,34 +22,34 @@ _CONTINUED = "\n    "
 
 
 def shown(text: str) -> str:
-    """One line for a terminal, with an escape for every character that a terminal would obey."""
+    """Return one line for a terminal, with an escape for every character that a terminal would obey."""
     if text.isascii() and text.isprintable():
         return text
     return _OBEYED.sub(_escaped, text)
 
 
 def shown_lines(text: str) -> str:
-    """Lines for a terminal; each is escaped, and the line breaks stay."""
+    """Return lines for a terminal; each is escaped, and the line breaks stay."""
     return "\n".join(map(shown, text.split("\n")))
 
 
 def shown_continued(text: str) -> str:
-    """As `shown_lines`, but lines after the first are indented, so that a text from outside begins no line."""
+    """Return `shown_lines` with the lines after the first indented, so that a text from outside begins no line."""
     return shown_lines(text).replace("\n", _CONTINUED)
 
 
 def shown_json(text: str) -> str:
-    """JSON with \\u escapes for those characters that JSON leaves as they are and a terminal would obey."""
+    """Return JSON with \\u escapes for those characters that JSON leaves as they are and a terminal would obey."""
     return text if text.isascii() and text.isprintable() else _BEYOND_JSON.sub(_json_escaped, text)
 
 
 def storable(text: str) -> str:
-    """Text that every database takes: NUL and surrogates, which come from bytes that are not text, become escapes."""
+    """Return text that every database takes: NUL and surrogates, which come from other bytes, become escapes."""
     return _NOT_TO_STORE.sub(_escaped, text)
 
 
 def storable_data(value: object) -> object:
-    """Plain data in which every text is `storable`; names of fields too."""
+    """Return plain data in which every text is `storable`; names of fields too."""
     if isinstance(value, str):
         return storable(value)
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Kinds of jobs, declared once for steps, worker, audit and web; the list of all kinds, and their words."""
+"""Kinds of jobs, declared once for steps, worker, audit and web; the list of all kinds, and their labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GROUP = "orthocapture.jobs"  # entry points of plug-ins; each names a JobKind
 
 @cache
 def job_kinds() -> Mapping[str, JobKind[Any, Any]]:
-    """All job kinds by name, in the order in which a run uses them: those of this package, and those of plug-ins.
+    """Return all job kinds by name, as a run uses them one after the other: this package's and those of plug-ins.
 
     Raises:
         ConfigurationError: two declare the same name, or an entry point names something that is not a JobKind; also
@@ -23,11 +23,11 @@ def job_kinds() -> Mapping[str, JobKind[Any, Any]]:
     return KindsOnDemand[JobKind[Any, Any]](__name__, GROUP, JobKind, lambda kind: (kind.order, kind.name))
 
 
-# Of names that are not job kinds; each job kind declares its own words.
+# Labels of names that are not job kinds; each job kind declares its own label.
 _WORDS: Mapping[str, str] = {"ct": "CT series", "control_image": "images of the control spheres"}
 
 
 def term(name: str) -> str:
-    """Words for a name in the records: `CT surface` for ct_surface; an unknown name with spaces."""
+    """Return the label of a name in the records: `CT surface` for ct_surface; an unknown name with spaces."""
     kind = job_kinds().get(name)
     return kind.words if kind is not None else _WORDS.get(name, name.replace("_", " "))

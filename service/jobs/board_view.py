@@ -13,7 +13,7 @@ class Arguments(BoardSize):
 
 
 class Answer(JobRecord):
-    """Whether the whole board was found; its corners are in the job's file. `size` is width and height in pixels."""
+    """The board as an image shows it; its corners are in the job's file. `size` is width and height in pixels."""
 
     viewpoint: str
     size: tuple[int, int]

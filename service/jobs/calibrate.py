@@ -13,14 +13,14 @@ class Arguments(BoardSize):
     """Board images and what to solve from them.
 
     Attributes:
-        solve: which calibrations.
-        images: of the board.
-        camera: known intrinsics; None if they are solved.
-        corners: for each image, the file of its job `board_view`; None if the image has not been searched.
-        known: estimate of camera, mount and board, with which images of a part of the board can be used.
-        flatness_mm: largest bow of the board; None: nothing is stated.
+        solve: the calibrations to solve.
+        images: the images of the board.
+        camera: the known intrinsics; None if they are solved.
+        corners: the file of the job `board_view` of each image; None if the image has not been searched.
+        known: an estimate of camera, mount and board, with which images of a part of the board can be used.
+        flatness_mm: the largest bow of the board; None: not given.
         seen: the board as the calibration of `camera` saw it; None if the camera is solved here.
-        size_tolerance: largest relative error of the board's size; None: nothing is stated.
+        size_tolerance: the largest relative error of the board's size; None: not given.
     """
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
@@ -39,8 +39,8 @@ class CalibrationDetails(JobRecord):
     Attributes:
         views_without_board: images that were not used.
         partial_views: number of corners in each image of a part of the board; like `reasons` only with `known`.
-        reasons: why images were not used.
-        intrinsics: if they were solved.
+        reasons: the reasons why images were not used.
+        intrinsics: the intrinsics, if they were solved.
     """
 
     views_without_board: tuple[str, ...] = ()

@@ -39,12 +39,12 @@ class ProjectionUncertainty(JobRecord):
     """Standard deviation of a projected point, in px, and in mm at the board's distance.
 
     Attributes:
-        distance_m: of the board.
-        centre_px, centre_mm: at the image's centre.
-        worst_px, worst_mm: the largest.
-        rms_px, rms_mm: over the image.
-        x_px, y_px: columns and rows of the grid.
-        sigma_px, sigma_mm: on the grid, row by row.
+        distance_m: the board's distance.
+        centre_px, centre_mm: the value at the image's centre.
+        worst_px, worst_mm: the largest value.
+        rms_px, rms_mm: the root mean square over the image.
+        x_px, y_px: the columns and rows of the grid.
+        sigma_px, sigma_mm: the values on the grid, row by row.
     """
 
     distance_m: float
@@ -71,9 +71,9 @@ class KnownBoard(JobRecord):
     """An estimate of camera, mount and board, with its tolerances.
 
     Attributes:
-        camera: nominal, or estimated from the images like the two poses.
-        T_flange_camera: of the camera on the flange.
-        T_base_board: of the board.
+        camera: the camera, nominal, or estimated from the images like the two poses.
+        T_flange_camera: the camera's pose on the flange, (4, 4).
+        T_base_board: the board's pose in the base frame, (4, 4).
         spread: (12, 12); possible increments of the two poses.
         focal: relative tolerance of the focal length.
         centre: tolerance of the principal point, over the image's width.
@@ -93,11 +93,11 @@ class BoardSeen(JobRecord):
     """The calibration board: inner corners, the edge of a square, and how it is bent.
 
     Attributes:
-        pattern: printed on it.
-        columns, rows: of inner corners.
-        square_mm: edge of a square.
-        flatness_mm: largest bow that was stated.
-        bow_mm: how far its middle lies behind its sides, and behind its ends; None if it was taken as flat.
+        pattern: the pattern printed on it.
+        columns, rows: the numbers of columns and rows of inner corners.
+        square_mm: the edge of a square.
+        flatness_mm: the largest bow that was given.
+        bow_mm: the distance of its middle behind its sides, and behind its ends; None if it was taken as flat.
         bow_sigma_mm: standard deviations of the two.
     """
 
@@ -126,22 +126,22 @@ class Tilt(JobRecord):
 
 
 class Intrinsics(JobRecord):
-    """What is known about the calibrated camera besides its parameters.
+    """The facts about the calibrated camera besides its parameters.
 
     Attributes:
-        model: of the distortion.
-        board: that was seen.
-        n_views: number of images used.
+        model: the distortion's model.
+        board: the board that was seen.
+        n_views: the number of images used.
         images: names of the images used.
-        rms_px: residual of all corners.
-        per_view_rms_px: residual of each image's corners, in the order of `images`.
+        rms_px: the rms residual of all corners.
+        per_view_rms_px: the rms residual of each image's corners, in the order of `images`.
         excluded: images that were not used.
         sigma: standard deviation of each free parameter of the camera, in the parameter's own unit.
         sigma_independent: the same if the errors of corners were independent.
         sigma_by_image: the same from the scatter between images; None if there are too few.
         sigma_corner_px: standard deviation of a corner.
-        inflation: of the covariance, because errors within an image are alike.
-        covariance: of the free parameters.
+        inflation: the factor of the covariance, because errors within an image are alike.
+        covariance: the covariance of the free parameters.
     """
 
     model: str = ""
@@ -166,7 +166,7 @@ class Intrinsics(JobRecord):
 
 
 class Spread(JobRecord):
-    """How well T_flange_camera is known.
+    """The uncertainty of T_flange_camera.
 
     Attributes:
         covariance: (6, 6), translation in m, then rotation in rad.
@@ -188,10 +188,10 @@ class Residuals(JobRecord):
     """Differences between the board pose from each image, by name, and the one from the other images.
 
     Attributes:
-        mm: position, in the fit.
-        deg: rotation, in the fit.
-        held_out_mm: position, predicted by the other images alone.
-        held_out_deg: rotation, predicted by the other images alone.
+        mm: the difference of position, in the fit.
+        deg: the difference of rotation, in the fit.
+        held_out_mm: the difference of position, predicted by the other images alone.
+        held_out_deg: the difference of rotation, predicted by the other images alone.
     """
 
     mm: dict[str, float] = Field(default_factory=dict)
@@ -201,21 +201,21 @@ class Residuals(JobRecord):
 
 
 class RobotNoise(JobRecord):
-    """Repeatability of the arm's poses, 1σ; None where there were too few images to tell."""
+    """Repeatability of the arm's poses, 1σ; None where there were too few images to estimate it."""
 
     mm: float | None = None
     deg: float | None = None
 
 
 class BoardSizeByRobot(JobRecord):
-    """The board's true size over the stated one, as the robot's lengths show it.
+    """The board's true size over the given one, as the robot's lengths show it.
 
     Attributes:
-        ratio: by robot and images alone.
+        ratio: the ratio by robot and images alone.
         sigma: standard deviation of `ratio`.
-        tolerance: stated for the board, relative.
-        used: in the answer.
-        words: the same for people.
+        tolerance: the relative tolerance given for the board.
+        used: the ratio used in the answer.
+        words: a sentence on these for people.
     """
 
     ratio: float
@@ -241,7 +241,7 @@ class MethodSpread(JobRecord):
 
 
 class ArmRotations(JobRecord):
-    """Whether the arm's rotations determine the transform.
+    """The arm's rotations, which must differ enough to determine the transform.
 
     Attributes:
         rotation_spread_deg: largest rotation between two images.
@@ -269,23 +269,23 @@ class HandEye(JobRecord):
     """The hand-eye calibration.
 
     Attributes:
-        T_flange_camera: for the poses that the arm reports, without correction.
+        T_flange_camera: the transform for the poses that the arm reports, without correction.
         T_base_board: the board's pose.
-        sigma: of T_flange_camera.
-        residuals: by image.
-        robot_noise: of the arm's poses.
-        setup: eye-in-hand for a camera on the flange, eye-to-hand for one beside the robot.
-        method: that gave T_flange_camera.
+        sigma: the standard deviations of T_flange_camera.
+        residuals: the residuals by image.
+        robot_noise: the noise of the arm's poses.
+        setup: the camera's place: eye-in-hand for one on the flange, eye-to-hand for one beside the robot.
+        method: the method that gave T_flange_camera.
         methods: the transform by every method that gave an answer.
-        spread: between the methods.
+        spread: the differences between the methods.
         corner_sigma_px: standard deviation of a board corner.
-        motion: of the arm between the images.
-        excluded: reason, by image that no fit used.
+        motion: the arm's motion between the images.
+        excluded: the reason, by image that no fit used.
         turned: images in which the board was seen turned by 180°.
-        arm_held_out_rms_mm: error of held-out images, by terms of the arm's model; "none": poses as reported.
+        arm_held_out_rms_mm: the error of held-out images, by terms of the arm's model; "none": poses as reported.
         arm_correction: the answer with the arm's errors corrected; None if that does not improve held-out images.
-        board_size: by the robot.
-        findings: what robot and images contradict each other in, in words.
+        board_size: the board's size by the robot.
+        findings: sentences on what robot and images contradict each other in.
     """
 
     T_flange_camera: Matrix
@@ -308,5 +308,5 @@ class HandEye(JobRecord):
 
     @property
     def best(self) -> HandEye | ArmAnswer:
-        """What the registration uses: with the arm's correction, where there is one."""
+        """The answer that the registration uses: with the arm's correction, where there is one."""
         return self.arm_correction or self

@@ -30,6 +30,6 @@ KIND = JobKind(
     compute="service.worker.meshes:ct_surface",
     words="CT surface",
     order=20,
-    version=3,  # also tells the radius of the spheres
+    version=3,  # also gives the radius of the spheres
     demand=lambda _: Demand(memory_mb=1500, limit_s=7200),
 )

@@ -15,11 +15,11 @@ class SceneArguments(ImagesCamera, Mounting):
     """Arguments that all jobs of a registration share.
 
     Attributes:
-        images: of the captures, including control captures.
+        images: the images of the captures, including control captures.
         intrinsics_covariance: (8, 8) of fx, fy, cx, cy, k1, k2, p1, p2, or a covariance with its parameters' names.
-        spheres_m: centres in the scan.
+        spheres_m: the spheres' centres in the scan.
         sphere_covariance_m2: (3, 3) of each centre.
-        radius_m: of the spheres.
+        radius_m: the spheres' radius.
     """
 
     images: tuple[PosedPhotograph, ...]
@@ -30,7 +30,7 @@ class SceneArguments(ImagesCamera, Mounting):
 
 
 class Arguments(SceneArguments):
-    """How outlines are searched; `model` holds the poses if neither a robot nor spheres provide them.
+    """The way to search outlines; `model` holds the poses if neither a robot nor spheres provide them.
 
     `developed` holds the file of the job `develop` by viewpoint: outlines found in the photographs are then measured
     in these; None: in the photographs.

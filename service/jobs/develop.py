@@ -7,7 +7,7 @@ from service.jobs.records import Hash
 
 
 class Parameters(JobRecord):
-    """How the file is developed; the fields of DevelopParameters (service/compute/images/develop_parameters.py)."""
+    """The development parameters: the fields of DevelopParameters (service/compute/images/develop_parameters.py)."""
 
     demosaic: str
     white_balance: str
@@ -40,20 +40,20 @@ class Crop(JobRecord):
 
 
 class Answer(JobRecord):
-    """What was developed, and how.
+    """The development of a raw file.
 
     Attributes:
         raw: SHA-256 of the raw file.
-        parameters: as asked for.
-        white_balance: gains that the camera recorded, of red, green, blue and second green.
-        black_level: of the four photosites of the pattern.
-        white_level: of the sensor's values.
+        parameters: the parameters that were asked for.
+        white_balance: the gains that the camera recorded, of red, green, blue and second green.
+        black_level: the black levels of the four photosites of the pattern.
+        white_level: the largest of the sensor's values.
         area: width and height of the exposed area, px.
-        crop: of the picture in it.
-        shift_px: median shift of the picture against the JPEG, in x and y.
-        largest_shift_px: of a part of the picture.
-        rawpy: its version.
-        libraw: its version.
+        crop: the picture's place in it.
+        shift_px: the median shift of the picture against the JPEG, in x and y.
+        largest_shift_px: the largest shift of a part of the picture.
+        rawpy: the version of rawpy.
+        libraw: the version of LibRaw.
     """
 
     raw: Hash

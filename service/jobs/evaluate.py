@@ -23,17 +23,17 @@ class Arguments(JobRecord):
 
 
 class ControlSphere(JobRecord):
-    """What one control sphere shows of a registration.
+    """The error of a registration at one control sphere.
 
     Attributes:
-        index: number in the list of control spheres, from 0.
+        index: its number in the list of control spheres, from 0.
         expected: number of images that should show it.
         measured: number of images in which it was measured.
-        radial_error_mm: mean over its outlines; None if it was not measured.
-        reprojection_error_px: mean over its outlines.
-        displacement_mm: from where scan and registration put it to where the images see it.
-        displacement_sigma_mm: of the displacement, as far as the outlines determine it.
-        finding: what is wrong, in words; empty if nothing is.
+        radial_error_mm: the mean over its outlines; None if it was not measured.
+        reprojection_error_px: the mean over its outlines.
+        displacement_mm: the distance from where scan and registration put it to where the images see it.
+        displacement_sigma_mm: the standard deviation of the displacement, as far as the outlines determine it.
+        finding: a sentence on what is wrong; empty if nothing is.
     """
 
     index: int
@@ -50,19 +50,19 @@ class Row(JobRecord):
     """One registration in the paper's table.
 
     Attributes:
-        poses: name of the registration.
-        source: of its camera poses.
-        resolution: of the images.
+        poses: the registration's name.
+        source: the source of its camera poses.
+        resolution: the images' resolution.
         images: number of control images with a pose.
-        predicted_error_mm: of the error budget.
-        control_error_mm: error of the control spheres as located in the images; None without any.
-        control_normalised_chi2: of that error against its predicted covariance.
-        mean_radial_error_mm: as the paper defines it.
-        mean_reprojection_error_px: as the paper defines it.
-        evaluated_on: `control spheres`, or `each sphere left out`.
+        predicted_error_mm: the error by the error budget.
+        control_error_mm: the error of the control spheres as located in the images; None without any.
+        control_normalised_chi2: the χ² of that error against its predicted covariance, normalised.
+        mean_radial_error_mm: the mean radial error as the paper defines it.
+        mean_reprojection_error_px: the mean reprojection error as the paper defines it.
+        evaluated_on: the spheres that were compared: `control spheres`, or `each sphere left out`.
         control_outlines: number of outlines compared.
         control_spheres: each control sphere by itself; empty in jobs of earlier versions.
-        late: when the row arrived, in words, if that was after the evaluation.
+        late: a text that says when the row arrived, if that was after the evaluation.
     """
 
     poses: str
@@ -81,7 +81,7 @@ class Row(JobRecord):
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What is wrong with control spheres, in words."""
+        """Sentences on what is wrong with control spheres."""
         return tuple(sphere.finding for sphere in self.control_spheres if sphere.finding)
 
 

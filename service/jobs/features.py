@@ -7,11 +7,11 @@ from service.jobs.records import ImageFile, ImagesCamera
 
 
 class SfmEffort(JobRecord):
-    """How much effort structure from motion makes; SfmOptions has further fields, and the same defaults.
+    """The effort of structure from motion; SfmOptions has further fields, and the same defaults.
 
     Attributes:
-        max_image_size: features are searched in images reduced to this longer side, px.
-        max_features: per image.
+        max_image_size: the longer side, px, of the reduced images in which features are searched.
+        max_features: the most features of one image.
         neighbours: number of images that each image is matched with.
     """
 
@@ -43,7 +43,7 @@ KIND = JobKind(
     answer=NoAnswer,
     compute="service.worker.front_end:features",
     words="features of the images",
-    version=3,  # of too many, those with small scales are kept
+    version=3,  # of too many, those with small scales remain
     order=40,
     aside=True,
     demand=lambda arguments: Demand(memory_mb=1100, limit_s=3600 + 300 * len(arguments.images)),

@@ -15,11 +15,11 @@ class FirstCamera(JobRecord):
     """The registration of the first camera's images.
 
     Attributes:
-        T_world_scan: with its covariance (6, 6).
-        T_scan_camera: by viewpoint.
+        T_world_scan: the registration, whose covariance is (6, 6).
+        T_scan_camera: the camera's pose by viewpoint.
         camera: its intrinsics.
-        outlines: file with the outlines in its images.
-        intrinsics_covariance: None: not known.
+        outlines: the file with the outlines in its images.
+        intrinsics_covariance: the covariance of its intrinsics; None: not known.
     """
 
     T_world_scan: Matrix
@@ -36,13 +36,13 @@ class Arguments(JobRecord):
     Attributes:
         device: name of the camera in rig.yaml.
         mounted: fixed in the room, or rigid beside the first camera.
-        images: by the viewpoint at which they were taken.
+        images: the images with the viewpoints at which they were taken.
         calibration: file with the camera's intrinsics, as `calibrate intrinsics` writes it.
-        first: where the first camera was; only for a rigid one.
-        spheres_m: centres in the scan.
+        first: the first camera's registration; only for a rigid one.
+        spheres_m: the spheres' centres in the scan.
         sphere_covariance_m2: (3, 3) of each centre.
-        radius_m: of the spheres.
-        colour: of the spheres, if the protocol states it.
+        radius_m: the spheres' radius.
+        colour: the spheres' colour, if the protocol gives it.
         developed: file of the job `develop` by viewpoint, in which the outlines are measured; None: in the images.
     """
 
@@ -65,16 +65,16 @@ class Answer(JobRecord):
         device: name of the camera in rig.yaml.
         mounted: fixed in the room, or rigid beside the first camera.
         camera: its intrinsics.
-        calibration: file with them.
-        outlines: file with the outlines of its images, by viewpoint.
-        measured_on: whether these were measured in its JPEGs or in its developed raw files.
-        T_outer_camera: None if its images do not determine it; `why` gives the reason.
-        covariance: (6, 6) of it, m and rad.
-        views: on which it rests.
-        excluded: images left out, with the reason.
-        consistency_mm: rms distance of the views' own poses from it.
-        consistency_mrad: rms angle between them and it.
-        chi2_reduced: of the views against the noise of their outlines.
+        calibration: the file with the intrinsics.
+        outlines: the file with the outlines of its images, by viewpoint.
+        measured_on: the kind of images in which these were measured: its JPEGs or its developed raw files.
+        T_outer_camera: the pose; None if its images do not determine it; `why` gives the reason.
+        covariance: the pose's covariance (6, 6), m and rad.
+        views: the views on which it rests.
+        excluded: the images left out, with the reason.
+        consistency_mm: the rms distance of the views' own poses from it.
+        consistency_mrad: the rms angle between them and it.
+        chi2_reduced: the reduced χ² of the views against the noise of their outlines.
     """
 
     device: str
@@ -99,7 +99,7 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.further_camera:further_camera",
     words="further camera",
-    version=3,  # states that light displaces single spheres
+    version=3,  # reports that light displaces single spheres
     order=62,
     demand=lambda arguments: Demand(
         memory_mb=600 + IMAGE_MB * processes_for(len(arguments.images), IMAGE_MB),

@@ -11,10 +11,10 @@ class Arguments(JobRecord):
 
     Attributes:
         device: name of the camera in rig.yaml.
-        image: at which viewpoint it was taken, and its file.
+        image: the viewpoint at which it was taken, and its file.
         calibration: file with the camera's intrinsics, as `calibrate intrinsics` writes it.
-        spheres_m: centres in the CT.
-        radius_m: of the spheres.
+        spheres_m: the spheres' centres in the CT.
+        radius_m: the spheres' radius.
     """
 
     device: str
@@ -25,14 +25,14 @@ class Arguments(JobRecord):
 
 
 class Answer(JobRecord):
-    """What the image shows.
+    """The camera's pose by one image.
 
     Attributes:
-        viewpoint: at which it was taken.
+        viewpoint: the viewpoint at which the image was taken.
         device: name of the camera in rig.yaml.
         T_ct_camera: the camera's pose by this image alone; None if it shows too few spheres, and `reason` says so.
-        reason: why there is no pose.
-        black: whether the image is black.
+        reason: the reason why there is no pose.
+        black: true if the image is black.
     """
 
     viewpoint: str

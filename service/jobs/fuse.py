@@ -15,13 +15,13 @@ class Region(JobRecord):
     """A part of space in which a person says which source counts: a polygon, or a box along the axes.
 
     Attributes:
-        source: that counts there.
-        frame: of the positions.
-        by: who drew it.
-        corners_m: (K, 3) of a polygon, in order; empty for a box.
-        along: from the surface towards the viewer of the polygon; None: away from the table.
-        below_m, above_m: how far the polygon reaches beyond its lowest and highest corner.
-        centre_m, size_m: of a box.
+        source: the source that counts there.
+        frame: the frame of the positions.
+        by: the person who drew it.
+        corners_m: (K, 3) corners of a polygon, in order; empty for a box.
+        along: the direction from the surface towards the viewer of the polygon; None: away from the table.
+        below_m, above_m: the polygon's reach beyond its lowest and highest corner.
+        centre_m, size_m: centre and size of a box.
     """
 
     source: Literal["ct", "scan"]
@@ -41,11 +41,11 @@ class Arguments(JobRecord):
     Attributes:
         ct_mesh, scan_mesh: vertices and faces, in the frame of each.
         ct, scan: the spheres in them.
-        ct_registration, scan_registration: with the same camera poses.
-        blend_m: width of the overlap over which the sources change.
-        spacing_m: of the samples for the Chamfer distance.
-        post_radius_m: of the spheres' posts, which are then cut out with the spheres; None: nothing is cut out.
-        regions: where people decided, the later overruling the earlier.
+        ct_registration, scan_registration: the registrations with the same camera poses.
+        blend_m: the width of the overlap over which the sources change.
+        spacing_m: the spacing of the samples for the Chamfer distance.
+        post_radius_m: the radius of the spheres' posts, which are then cut out with the spheres; None: no cut.
+        regions: the regions where people decided, the later overruling the earlier.
         simulated: the run is, and the meshes say so; jobs of earlier versions did not say it.
     """
 
@@ -64,15 +64,15 @@ class Arguments(JobRecord):
 
 
 class Answer(JobRecord):
-    """How the ground truth was made.
+    """The ground truth's transforms and regions.
 
     Attributes:
-        T_scan_ct: from sphere to sphere; the CT was moved by it.
-        covariance: (6, 6) of it, m and rad.
-        T_scan_ct_by_images: through the cameras; None without images.
+        T_scan_ct: the transform from sphere to sphere; the CT was moved by it.
+        covariance: the covariance (6, 6) of T_scan_ct, m and rad.
+        T_scan_ct_by_images: the same transform through the cameras; None without images.
         wound_m: (K, 3) outline of the wound's region in the scan's frame; empty without a wound.
-        regions: that people drew and that were used.
-        taken_away: spheres, by their numbers in the CT, that were cut out because the scan lacks them.
+        regions: the regions that people drew and that were used.
+        taken_away: the spheres, by their numbers in the CT, that were cut out because the scan does not have them.
     """
 
     T_scan_ct: Matrix

@@ -29,7 +29,7 @@ class PlannedPlace(JobRecord):
 
 
 class HemisphereArguments(JobRecord):
-    """What the jobs on all hand-held images of a step share: the hemisphere to be covered."""
+    """The part that the jobs on all hand-held images of a step share: the hemisphere to be covered."""
 
     places: tuple[PlannedPlace, ...]
     within_deg: float
@@ -47,7 +47,7 @@ class HeldArguments(HemisphereArguments):
 
 
 class SpecimenArguments(HemisphereArguments):
-    """What the jobs on all images of the specimen share: the camera, the spheres and the limits.
+    """The part that the jobs on all images of the specimen share: the camera, the spheres and the limits.
 
     Jobs of earlier versions predicted errors without those of the calibration and of the scan.
     """
@@ -77,7 +77,7 @@ class PlaceStatus(JobRecord):
 
 
 class Answer(JobRecord):
-    """Whether the image is used, the camera's pose, and directions to the next place."""
+    """The image's use, the camera's pose, and directions to the next place."""
 
     viewpoint: str
     used: bool
@@ -88,7 +88,7 @@ class Answer(JobRecord):
     T_level_camera: Matrix | None = None
     places: tuple[PlaceStatus, ...] = ()
     cells: tuple[tuple[int, ...], ...] = ()  # number of board corners in each cell of the frame
-    spheres_m: tuple[Point, ...] = ()  # as the images up to this one locate them
+    spheres_m: tuple[Point, ...] = ()  # the spheres as the images up to this one locate them
     T_scene_cameras: dict[str, Matrix] = Field(
         default_factory=dict[str, Matrix]
     )  # of all images, refined by this one

@@ -20,18 +20,18 @@ class HybridModel(JobRecord):
     """The file of the adjusted poses.
 
     Attributes:
-        T_world_camera: by viewpoint.
+        T_world_camera: the camera's pose by viewpoint.
         pose_covariance: (6, 6) of each T_frame_camera, m and rad.
-        pose_covariance_frame: that frame: `scan`.
+        pose_covariance_frame: the name of that frame: `scan`.
         T_world_scan: the registration.
-        T_world_station: base of each station.
+        T_world_station: the base of each station.
         scan_covariance: (6, 6) of T_world_scan, m and rad.
-        predicted_error_mm: at the middle of the spheres.
-        sigma_track_px: of one observation of a track.
-        sphere_factor: of the outlines' residuals over their own sigmas.
-        sigma_robot_m: of a coordinate of the robot's positions; None without a robot.
-        sigma_robot_rad: of its rotations, about each axis; None without a robot.
-        chi2: reduced chi-squared, by kind of observation.
+        predicted_error_mm: the predicted error at the middle of the spheres.
+        sigma_track_px: the standard deviation of one observation of a track.
+        sphere_factor: the factor of the outlines' residuals over their own sigmas.
+        sigma_robot_m: the standard deviation of a coordinate of the robot's positions; None without a robot.
+        sigma_robot_rad: that of its rotations, about each axis; None without a robot.
+        chi2: the reduced χ², by kind of observation.
     """
 
     T_world_camera: dict[str, Matrix]

@@ -13,7 +13,7 @@ from service.core.jobs import Jobs, resolve
 
 
 class JobRecord(BaseModel):
-    """Base of arguments and answers: frozen; fields of older or newer versions are kept.
+    """Base of arguments and answers: frozen; fields of older or newer versions stay.
 
     Only fields that were set are written, so that a recorded answer and its recomputation are equal.
     """
@@ -21,11 +21,11 @@ class JobRecord(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True, defer_build=True)
 
     def plain(self) -> dict[str, Any]:
-        """The record as it is written into an event."""
+        """Return the record as it is written into an event."""
         return self.model_dump(mode="json", exclude_unset=True)
 
     def set_fields(self) -> dict[str, Any]:
-        """The fields that were set, unconverted, for use in another record."""
+        """Return the fields that were set, unconverted, for use in another record."""
         return {name: getattr(self, name) for name in self.model_fields_set}
 
 
@@ -35,7 +35,7 @@ class NoAnswer(JobRecord):
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What a job takes from the machine that computes it.
+    """The memory and the time that a job takes from the machine that computes it.
 
     Attributes:
         memory_mb: the most that it and the processes that it starts need together.
@@ -47,7 +47,7 @@ class Demand:
 
 
 def usual_demand(_arguments: JobRecord) -> Demand:
-    """The demand of a kind that states none, such as one of a plug-in."""
+    """Return the demand of a kind that declares none, such as one of a plug-in."""
     return Demand(memory_mb=1000, limit_s=7200)
 
 
@@ -63,19 +63,19 @@ class JobKind(Generic[A, R]):
     """One kind of computation, declared once.
 
     Attributes:
-        name: of the kind, as it is recorded.
-        arguments: of a job, with references resolved.
-        answer: plain data that it yields in addition to measures and files.
+        name: the kind's name, as it is recorded.
+        arguments: the type of a job's arguments, with references resolved.
+        answer: the type of the plain data that it yields in addition to measures and files.
         compute: `module:function`, imported at the first such job. The function takes a JobContext[arguments] and
             returns a JobAnswer (service/worker/job.py).
-        words: its name for people.
-        version: of the computation. In version 1 the arguments hold copies of earlier results, since then references
-            to them; all are read. From version 3 on, each gives other numbers than the one before.
-        order: position among the kinds in lists and texts, as a run uses them.
-        replayed: whether a replay recomputes it by default; not for kinds that only help during a capture.
-        aside: whether the provenance drawing omits it, because no result depends on it.
-        demand: what a job with these arguments takes: measured for surfaces (bench/results/job_memory-*.json),
-            estimated for images.
+        words: its label, for people.
+        version: the computation's version. In version 1 the arguments hold copies of earlier results, since then
+            references to them; all are read. From version 3 on, each gives other numbers than the one before.
+        order: its position among the kinds in lists and texts, as a run uses them.
+        replayed: true if a replay recomputes it by default; not for kinds that only help during a capture.
+        aside: true if the provenance drawing omits it, because no result depends on it.
+        demand: returns what a job with these arguments takes: measured for surfaces
+            (bench/results/job_memory-*.json), estimated for images.
     """
 
     name: str
@@ -90,7 +90,7 @@ class JobKind(Generic[A, R]):
     demand: Callable[[A], Demand] = usual_demand
 
     def other_numbers(self, recorded_version: int) -> str:
-        """That another version computed a recorded job, with other numbers or fewer; "" if this one did."""
+        """Say that another version computed a recorded job, with other numbers or fewer; "" if this one did."""
         if max(recorded_version, _FIRST_NUMBERS) == max(self.version, _FIRST_NUMBERS):
             return ""
         return (
@@ -99,21 +99,21 @@ class JobKind(Generic[A, R]):
         )
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:
-        """The arguments of a recorded job of any version. Raises IntegrityError."""
+        """Return the arguments of a recorded job of any version. Raises IntegrityError."""
         return _read(self.arguments, resolve(recorded, jobs), f"the arguments of a job {self.name}")
 
     def read_answer(self, recorded: Mapping[str, Any]) -> R:
-        """The answer of a recorded job of any version. Raises IntegrityError."""
+        """Return the answer of a recorded job of any version. Raises IntegrityError."""
         return _read(self.answer, recorded, f"the answer of a job {self.name}")
 
 
 def read_part(part: type[_T], recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> _T:
-    """Some fields of a job's recorded arguments; references in its other fields are not resolved.
+    """Return some fields of a job's recorded arguments; references in its other fields are not resolved.
 
     Args:
         part: a record with only these fields.
         recorded: arguments of a job of any kind that has them, and of any version.
-        jobs: of the run, for references.
+        jobs: the run's jobs, for references.
 
     Raises:
         IntegrityError: the arguments do not have these fields, or a reference has no value.

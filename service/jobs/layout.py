@@ -26,7 +26,7 @@ class Arguments(JobRecord):
 
 
 class SphereMove(JobRecord):
-    """A move of a sphere, in words and between places in the photograph, as fractions of its width and height."""
+    """A move of a sphere, as text and between places in the photograph, as fractions of its width and height."""
 
     model_config = ConfigDict(serialize_by_alias=True, validate_by_name=True, validate_by_alias=True)
 
@@ -46,7 +46,7 @@ class SearchedPhotograph(JobRecord):
 class LayoutDetails(JudgedLayout):
     """The judged layout, its photographs, and the moves that would resolve its near-symmetries."""
 
-    chi2: float | None = None  # of the adjustment of the photographs
+    chi2: float | None = None  # reduced χ² of the adjustment of the photographs
     photographs: tuple[SearchedPhotograph, ...] = ()
     moves: tuple[SphereMove, ...] = ()
 

@@ -10,14 +10,14 @@ class LiveArguments(Mounting):
     """Arguments of all jobs during a capture by the robot.
 
     Attributes:
-        camera: calibrated.
+        camera: the calibrated camera.
         hand_eye_covariance: (6, 6) of T_flange_camera, m and rad.
-        arm_sigma_m: prior scatter of the camera's positions.
-        arm_sigma_rad: prior scatter of the camera's rotations.
-        spheres_m: centres in the CT.
-        radius_m: of the spheres.
-        limits: when a view counts for the coverage.
-        surface: file of the job `coverage_points`; None until it has finished.
+        arm_sigma_m: the prior scatter of the camera's positions.
+        arm_sigma_rad: the prior scatter of the camera's rotations.
+        spheres_m: the spheres' centres in the CT.
+        radius_m: the spheres' radius.
+        limits: the conditions on which a view counts for the coverage.
+        surface: the file of the job `coverage_points`; None until it has finished.
     """
 
     camera: Camera

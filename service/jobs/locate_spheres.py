@@ -23,6 +23,6 @@ KIND = JobKind(
     compute="service.worker.meshes:locate_spheres",
     words="spheres in the mesh",
     order=21,
-    version=3,  # also tells the radius of the spheres, and the scale between two meshes
+    version=3,  # also gives the radius of the spheres, and the scale between two meshes
     demand=lambda _: Demand(memory_mb=1000, limit_s=3600),
 )

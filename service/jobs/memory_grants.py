@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class Grant(Record):
-    """What one process has been granted for its job, or waits for."""
+    """The memory that one process has been granted for its job, or waits for."""
 
     host: str
     boot: str
@@ -41,12 +41,12 @@ class Grant(Record):
     process_started_s: float
     job: str
     memory_mb: float
-    waits: str = ""  # why, in words; "" for one that has been granted
-    place: int = 0  # in the order in which those that wait came
+    waits: str = ""  # the reason, as a phrase; "" for one that has been granted
+    place: int = 0  # the place in the queue of those that wait
 
     @property
     def lives(self) -> bool:
-        """Whether its process is not known to be dead."""
+        """True if its process is not known to be dead."""
         identity = ProcessIdentity(self.host, self.boot, self.pid, self.process_started_s)
         return identity.life() != "dead"
 
@@ -57,9 +57,9 @@ class MemoryGrants:
 
     Attributes:
         data: the data folder.
-        clock: of the worker.
-        memory: of the machine.
-        patience_s: for how long a job waits for other programs alone.
+        clock: the worker's clock.
+        memory: returns the machine's memory.
+        patience_s: the time for which a job waits for other programs alone.
     """
 
     data: Path
@@ -72,12 +72,12 @@ class MemoryGrants:
         """Wait until a job fits beside what runs; within the block its memory is granted.
 
         Args:
-            job: id.
-            memory_mb: that it needs at most, with what this process has already.
-            tell: called with why it waits, whenever that changes.
+            job: the job's id.
+            memory_mb: the most that it needs, with what this process has already.
+            tell: called with the reason of the wait, whenever that changes.
 
         Raises:
-            ComputeError: the machine does not have that much, or other programs have kept it for long.
+            ComputeError: the machine does not have that much, or other programs have occupied it for long.
         """
         whole = self.memory()
         if memory_mb > whole.total_mb - _RESERVE_MB:
@@ -128,13 +128,13 @@ class MemoryGrants:
                 part = own.with_suffix(".part")
                 part.write_text(grant.model_dump_json(), encoding="utf-8")
                 part.replace(own)
-        except OSError as error:  # a disk that is full must not keep a job from being computed
+        except OSError as error:  # a disk that is full must not prevent a job from being computed
             _log.warning("the memory of jobs on this machine cannot be written down: %s", error)
             return wanted.model_copy(update={"waits": ""})
         return grant
 
     def _why_not(self, wanted: Grant, others: Sequence[Grant]) -> str:
-        """Why a job cannot begin beside the others, in words; "" if it can."""
+        """Return why a job cannot start beside the others; "" if it can."""
         used_mb = {grant.pid: _used_mb(grant.pid) for grant in (wanted, *others)}
         granted = [other for other in others if not other.waits]
         free_mb = self.memory().available_mb - _RESERVE_MB
@@ -151,12 +151,12 @@ class MemoryGrants:
 
 
 def waiting_for_memory(data: Path) -> dict[str, str]:
-    """Why each job on this machine that waits for memory does so, in words, by the job's id."""
+    """Return why each job on this machine that waits for memory does so, as text by the job's id."""
     return {grant.job: grant.waits for grant in _grants(data) if grant.waits}
 
 
 def _grants(data: Path) -> Iterator[Grant]:
-    """Those of living processes of this machine; the files of dead ones are removed."""
+    """Yield the grants of living processes of this machine; remove the files of dead ones."""
     for path in sorted(_folder(data).glob(f"{_here().host}-*.json")):
         try:
             grant = Grant.model_validate_json(path.read_bytes())
@@ -182,7 +182,7 @@ def _alone(folder: Path) -> Generator[None]:
 
 
 def _used_mb(pid: int) -> float:
-    """Memory of a process and of those that it started; 0 for one that has ended."""
+    """Return the memory of a process and of those that it started; 0 for one that has ended."""
     try:
         process = psutil.Process(pid)
         return sum(megabytes(one.memory_info().rss) for one in (process, *process.children(recursive=True)))
@@ -191,7 +191,7 @@ def _used_mb(pid: int) -> float:
 
 
 def _rounded(memory_mb: float) -> int:
-    """To 50 MB, so that the words do not change all the time."""
+    """Round to 50 MB, so that the text does not change all the time."""
     return max(0, 50 * round(memory_mb / 50))
 
 

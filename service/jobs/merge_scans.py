@@ -19,7 +19,7 @@ class Arguments(JobRecord):
 class Answer(SpheresFound):
     """The spheres of the merged mesh, which is in the frame of the first part."""
 
-    T_mesh_part: tuple[Matrix, ...]  # of each part
+    T_mesh_part: tuple[Matrix, ...]  # the pose of each part
 
 
 KIND = JobKind(

@@ -16,12 +16,12 @@ Hash = str  # SHA-256 of an artefact
 
 
 def matrix(rows: Iterable[Iterable[float]]) -> Matrix:
-    """The rows of an array as a record holds them."""
+    """Return the rows of an array as a record holds them."""
     return tuple(tuple(float(value) for value in row) for row in rows)
 
 
 def matrices(arrays: Mapping[str, Iterable[Iterable[float]]]) -> dict[str, Matrix]:
-    """Arrays by name as a record holds them."""
+    """Return arrays by name as a record holds them."""
     return {name: matrix(rows) for name, rows in arrays.items()}
 
 
@@ -52,7 +52,7 @@ class ImagesCamera(JobRecord):
     """The camera of a job's images.
 
     Attributes:
-        camera: at the size of the photographs, or, with `full_camera`, at that of the reduced images.
+        camera: the camera at the size of the photographs, or, with `full_camera`, at that of the reduced images.
         reduced_to: width and height to which the photographs are reduced first; None: used at full size.
         full_camera: camera at the size of the photographs, in arguments of version 1 for reduced images.
     """
@@ -63,7 +63,7 @@ class ImagesCamera(JobRecord):
 
     @property
     def reduced(self) -> bool:
-        """Whether the photographs are reduced first."""
+        """True if the photographs are reduced first."""
         return self.reduced_to is not None or self.full_camera is not None
 
 
@@ -78,12 +78,12 @@ class PosedPhotograph(ImageFile):
     """A photograph and the pose of its camera.
 
     Attributes:
-        name: of the image in a data set.
-        step: in which it was taken.
-        station: of the robot; "" without one.
-        T_base_flange: as the arm reported it; None if a person held the camera.
-        joints_rad: reported with it.
-        T_scene_camera: of a hand-held camera, from the spheres in the image.
+        name: the image's name in a data set.
+        step: the step in which it was taken.
+        station: the robot's station; "" without one.
+        T_base_flange: the flange's pose as the arm reported it, (4, 4); None if a person held the camera.
+        joints_rad: the joints reported with it.
+        T_scene_camera: the pose of a hand-held camera, from the spheres in the image, (4, 4).
     """
 
     name: str = ""
@@ -98,13 +98,13 @@ class ArmCorrection(JobRecord):
     """The errors of an arm as the hand-eye calibration estimated them, for N joints.
 
     Attributes:
-        T_flange_camera: of the camera on the flange, for corrected poses.
-        arm: name of the arm's model.
-        model: which parameters the correction has, in words.
+        T_flange_camera: the camera's pose on the flange, for corrected poses.
+        arm: the name of the arm's model.
+        model: a phrase that names the parameters of the correction.
         dh_deltas: (N, 5) added to a, d (metres), α, θ, β (radians) of each joint; (N, 4), without β, in records of
             the camera calibration before version 4.
         gear_cos_rad, gear_sin_rad: (N, H) amplitudes of the periodic errors of each joint.
-        observed: share of each joint's error that the images determine, 0 … 1.
+        observed: the share of each joint's error that the images determine, 0 … 1.
     """
 
     T_flange_camera: Matrix
@@ -118,12 +118,12 @@ class ArmCorrection(JobRecord):
 
 
 class FurtherArm(JobRecord):
-    """How the camera was mounted on another arm of the rig, calibrated on its own.
+    """The camera's mounting on another arm of the rig, calibrated on its own.
 
     Attributes:
-        T_flange_camera: for uncorrected poses of this arm.
-        arm_correction: of its reported poses; None if they are used uncorrected.
-        stations: at which this arm stood.
+        T_flange_camera: the camera's pose on the flange, for uncorrected poses of this arm.
+        arm_correction: the correction of its reported poses; None if they are used uncorrected.
+        stations: the stations at which this arm stood.
     """
 
     T_flange_camera: Matrix
@@ -132,13 +132,14 @@ class FurtherArm(JobRecord):
 
 
 class Mounting(JobRecord):
-    """How the camera was mounted on the arm.
+    """The camera's mounting on the arm.
 
     Attributes:
-        T_flange_camera: for uncorrected poses of the arm; None if a person held the camera, or the mount is unknown.
-        arm_correction: of the reported poses; None if they are used uncorrected.
-        arm_stations: stations of the corrected arm.
-        further_arms: that carried the camera at other stations.
+        T_flange_camera: the camera's pose on the flange, for uncorrected poses of the arm; None if a person held the
+            camera, or the mount is unknown.
+        arm_correction: the correction of the reported poses; None if they are used uncorrected.
+        arm_stations: the stations of the corrected arm.
+        further_arms: the arms that carried the camera at other stations.
     """
 
     T_flange_camera: Matrix | None = None
@@ -148,7 +149,7 @@ class Mounting(JobRecord):
 
 
 def has_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> bool:
-    """Whether the poses of images are known before their registration.
+    """Return whether the poses of images are known before their registration.
 
     Those of images from an arm with an unknown mount, or from a turntable, are not.
     """
@@ -166,7 +167,7 @@ class BoardSize(JobRecord):
 
 
 class Limits(JobRecord):
-    """When a view counts for a point of the specimen's surface."""
+    """The limits within which a view counts for a point of the specimen's surface."""
 
     min_views: int
     max_angle_deg: float
@@ -177,14 +178,14 @@ class MeasuredSphere(JobRecord):
     """A sphere found in a mesh.
 
     Attributes:
-        centre_m: in the mesh's frame.
-        covariance_m2: of the centre.
-        sigma_mm: root of the covariance's trace.
-        rms_mm: distance of the mesh's points from the sphere.
+        centre_m: its centre in the mesh's frame.
+        covariance_m2: the centre's covariance, (3, 3).
+        sigma_mm: the root of the covariance's trace.
+        rms_mm: the rms distance of the mesh's points from the sphere.
         radius_residual_mm: fitted radius minus the known one.
         radius_sigma_mm: standard deviation of `radius_residual_mm`.
-        coverage: share of the sphere's surface that the mesh has.
-        n_points: number of points that were used.
+        coverage: the share of the sphere's surface that the mesh has.
+        n_points: the number of points that were used.
     """
 
     centre_m: Point
@@ -227,15 +228,15 @@ class SphereConfusion(JobRecord):
 
 
 class JudgedLayout(JobRecord):
-    """How well the spheres of a layout can be told apart (service/compute/layout/ambiguity.py).
+    """The judgement of how well the spheres of a layout can be distinguished (service/compute/layout/ambiguity.py).
 
     Attributes:
-        passed: nothing must be changed.
-        problems: what must be changed.
-        margin_mm: least misfit of a wrong assignment of four spheres.
+        passed: true if nothing must be changed.
+        problems: the things that must be changed.
+        margin_mm: the least misfit of a wrong assignment of four spheres.
         margin_sigma_mm: its standard deviation.
-        bounds: uncertainty of each measure of the layout, mm.
-        margin_by_count_mm: least misfit by number of visible spheres.
+        bounds: the uncertainty of each measure of the layout, mm.
+        margin_by_count_mm: the least misfit by number of visible spheres.
         worst: the assignments with the least misfit.
         depth_mm: rms distance of the centres from their best plane.
         extent_mm: rms distance of the centres from their mean.
@@ -278,5 +279,5 @@ class ParameterCovariance(JobRecord):
 
 
 def image_of(job: JobState) -> ImageFile:
-    """The photograph that such a job was given. Raises ValidationError for a job of another kind."""
+    """Return the photograph that such a job was given. Raises ValidationError for a job of another kind."""
     return ImageFile.model_validate(job.arguments["image"])

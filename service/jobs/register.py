@@ -14,10 +14,10 @@ POSE_ERRORS = "pose_errors"  # kind of the artefact with the errors of the poses
 
 
 class Arguments(SceneArguments):
-    """Outlines and the source of the poses, with its model if they come from the images.
+    """The outlines and the source of the poses, with its model if they come from the images.
 
     With `state_pose_errors`, which is for poses of an arm and of the spheres, the errors of the poses are estimated
-    and kept. Poses of the spheres then follow from the outlines alone, and images that show fewer than four spheres
+    and stored. Poses of the spheres then follow from the outlines alone, and images that show fewer than four spheres
     have none.
     """
 
@@ -37,7 +37,7 @@ class LeaveOneOut(JobRecord):
 
 
 class Contradiction(JobRecord):
-    """A contradiction between the inputs, in words, and what to do; `refuses`: before the result is used."""
+    """A contradiction between the inputs, as text, and what to do; `refuses`: before the result is used."""
 
     kind: str
     what: str
@@ -51,13 +51,13 @@ class Contradiction(JobRecord):
 
 
 class CommonError(JobRecord):
-    """An error that all outlines share, as they have it: in px, or for `focal_x` and `focal_y` relative.
+    """An error that all outlines share; values are in px, for `focal_x` and `focal_y` relative.
 
     Attributes:
-        name: of the error.
-        value: as a fit that leaves it free has it.
-        sigma: of the value.
-        expected: standard deviation by which it may differ from zero.
+        name: the error's name.
+        value: the value in a fit that leaves it free.
+        sigma: the value's standard deviation.
+        expected: the standard deviation by which it may differ from zero.
     """
 
     name: str
@@ -71,26 +71,26 @@ class Registration(JobRecord):
 
     Attributes:
         poses: the source of the camera poses.
-        camera: with which the outlines were detected.
-        outlines: file with the outlines.
-        full_camera: at the size of the photographs, if the images were reduced.
-        T_world_scan: world is the base of the first station, or the reconstruction's own frame.
-        scale: of the reconstruction; 1 for metric poses.
-        rms_px: of the outlines that were used.
-        T_world_station: by station.
-        T_scan_camera: by viewpoint.
-        T_scan_camera_given: of corrected poses of the arm, before the outlines refined them.
+        camera: the camera with which the outlines were detected.
+        outlines: the file with the outlines.
+        full_camera: the camera at the size of the photographs, if the images were reduced.
+        T_world_scan: the scan's pose; the world is the base of the first station, or the reconstruction's own frame.
+        scale: the reconstruction's scale; 1 for metric poses.
+        rms_px: the rms residual of the outlines that were used.
+        T_world_station: the station's pose, by station.
+        T_scan_camera: the camera's pose, by viewpoint.
+        T_scan_camera_given: the corrected poses of the arm, before the outlines refined them.
         covariance_given: (6, 6) of T_world_scan with these; both are set for corrected poses of the arm only.
-        excluded: outlines left out as outliers, in words.
+        excluded: phrases that name the outlines left out as outliers.
         covariance: (6, 6) of T_world_scan, m and rad.
         components: terms whose sum is the covariance.
-        leave_one_out: None if a station sees too few spheres for it.
-        pose_sigma_m: of a single pose of the arm, along each axis, before the outlines refined it; None: not stated.
-        pose_sigma_rad: of its rotation vector.
+        leave_one_out: the result without each sphere; None if a station sees too few spheres for it.
+        pose_sigma_m: 1σ of one pose of the arm, along each axis, before the outlines refined it; None: not given.
+        pose_sigma_rad: 1σ of its rotation vector.
         findings: contradictions between the inputs; empty in jobs of earlier versions, as the next three.
-        left_out: images that contradict the others, and why; they have no pose.
-        common_errors: of the outlines, whose part beyond the model is the component `unexplained`.
-        blur_px: of the outlines' edges, in the median.
+        left_out: the images that contradict the others, and why; they have no pose.
+        common_errors: the errors of the outlines, whose part beyond the model is the component `unexplained`.
+        blur_px: the blur of the outlines' edges, in the median.
     """
 
     poses: str
@@ -129,7 +129,7 @@ KIND = JobKind(
     answer=Registration,
     compute="service.worker.register:register",
     words="registration",
-    version=4,  # states that light displaces single spheres
+    version=4,  # reports that light displaces single spheres
     order=61,
     demand=lambda arguments: Demand(memory_mb=500 + len(arguments.images), limit_s=3600 + 20 * len(arguments.images)),
 )

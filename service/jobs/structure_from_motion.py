@@ -10,15 +10,15 @@ from service.jobs.records import Hash, ImagesCamera, Matrix, PosedPhotograph
 
 
 class Arguments(ImagesCamera):
-    """What is reconstructed, and how.
+    """The images and options of a reconstruction.
 
     Attributes:
-        images: of the captures.
-        mappers: each makes one model.
-        effort: how many features and pairs.
+        images: the images of the captures.
+        mappers: the mappers, each of which makes one model.
+        effort: the limits on image size, features and pairs.
         prior: T_scan_camera by viewpoint, of an earlier registration; decides which pairs are matched.
-        features: files by viewpoint; None in old runs, in which one job did everything.
-        matches: files.
+        features: the files of features by viewpoint; None in old runs, in which one job did everything.
+        matches: the files of matches.
     """
 
     images: tuple[PosedPhotograph, ...] = ()

@@ -40,16 +40,16 @@ _SHORT_SHARE, _SHORT_S = 0.4, 1.0
 
 
 class Starvation(Interface):
-    """How long this program was kept from running, since it was made."""
+    """The time for which this program was prevented from running, since it was made."""
 
     @property
     def seconds(self) -> float:
-        """The longest that one of its threads has waited."""
+        """The longest time that one of its threads has waited."""
         ...
 
     @property
     def share(self) -> float:
-        """Of the time in which it wanted to run, the part in which it could not: 0 to 1."""
+        """The part, 0 to 1, of the time in which it wanted to run and could not."""
         ...
 
 
@@ -60,7 +60,7 @@ def held_up_here() -> Starvation:
 
 @dataclass
 class WorkerWatch:
-    """Notices that jobs of a step wait and no worker runs, and tells the operator, from time to time again."""
+    """Notices that jobs of a step wait and no worker runs, and warns the operator, from time to time again."""
 
     data: Path
     tell: Callable[[str], None]
@@ -101,7 +101,7 @@ class StepExecution:
     held_up: Callable[[], Starvation] = held_up_here
 
     def execute(self, step_id: str, attempt: int) -> None:
-        """Execute a step and record its outcome or failure; an interruption by an operator is only told.
+        """Execute a step and record its outcome or failure; an interruption by an operator is only reported.
 
         No error of a step ends the run: after one that nobody foresaw the arms stand, and a person is asked.
         """

@@ -29,7 +29,7 @@ class LeaveWatch:
     Progress is a count on the screen that has not been as high since then. A failure, a new attempt, a device that
     is opened again are none. While the arm moves, while this thread computes or waits for a processor, and while a
     living worker computes what the step waits for, the time does not count. Where the two clocks of the host
-    contradict each other, the confirmation is over: nobody can tell how old it is.
+    contradict each other, the confirmation is over: nobody can say how old it is.
     """
 
     run: HeldRun
@@ -77,7 +77,7 @@ class LeaveWatch:
         self._account(counts=True)
 
     def lapsed(self, state: RunState) -> bool:
-        """Whether the leave is over; if so, that is recorded. Only for steps that move the robot."""
+        """Return whether the leave is over; if so, record it. Only for steps that move the robot."""
         if state.leave is None or not self.protocol.step(state.current).moves_robot:
             return False
         self._account(counts=True)

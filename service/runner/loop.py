@@ -62,7 +62,7 @@ class Runner:
     """Drives one run to its end, by the store's clock.
 
     `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures;
-    `held_up` begins to measure how long the machine keeps this program from running.
+    `held_up` begins to measure how long the machine prevents this program from running.
     """
 
     store: Store
@@ -136,7 +136,7 @@ class Runner:
         self._leave.end(self._run.refresh(), why)
 
     def submit(self, action: OperatorAction, actor: str) -> None:
-        """Record an action if it is allowed now; otherwise record its refusal and tell the operator why."""
+        """Record an action if it is allowed now; otherwise record its refusal and show the operator the reason."""
         refusal = refuse(self.protocol, self._run.refresh(), action, actor)
         if refusal is None:
             self._leave.given_here()

@@ -26,7 +26,7 @@ class Operator(Interface):
     name: str
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
-        """The answer, if there is one yet; called about ten times per second while a question is open.
+        """Return the answer, if there is one yet; called about ten times per second while a question is open.
 
         Raises PersonNeededError where nobody attends who could give it.
         """
@@ -41,7 +41,7 @@ class Operator(Interface):
         ...
 
     def busy(self, what: str) -> None:
-        """Say in words what a long call is about to do; screens show it until the next `attend`."""
+        """Say what a long call is about to do; screens show it until the next `attend`."""
         ...
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
@@ -53,7 +53,7 @@ class Operator(Interface):
         ...
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """The checklist items that count as done when the foot pedal confirms."""
+        """Return the checklist items that count as done when the foot pedal confirms."""
         ...
 
     def prepare(self, step: str, attempt: int) -> None:

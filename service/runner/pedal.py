@@ -18,7 +18,7 @@ _RETRY_S = 30.0
 # If the robot will move, one press arms the pedal and a second one, this many seconds after it, confirms; on a screen
 # the button is held instead. A press that comes sooner may be a bounce of the contact or a slip of the foot.
 SECOND_PRESS_S = (0.5, 6.0)
-LATE_S = 0.5  # between two readings, five times the usual: presses that lie between cannot be told apart
+LATE_S = 0.5  # between two readings, five times the usual: presses that lie between cannot be distinguished
 CLOCKS_DIFFER_S = 0.25  # by how much the box's clock and the host's may differ between two readings
 
 
@@ -46,15 +46,15 @@ class Pedal:
     _armed_by_s: float | None = field(init=False, default=None)  # the press that armed the pedal, by the box's clock
     _armed_at_s: float = field(init=False, default=0.0)  # when that was read
     _silent_until_s: float = field(init=False, default=0.0)
-    _told: str = field(init=False, default="")  # why the pedal does not work, told once until it works again
+    _told: str = field(init=False, default="")  # why the pedal does not work, reported once until it works again
 
     @property
     def armed(self) -> bool:
-        """Whether a second press would let the robot move."""
+        """True if a second press would let the robot move."""
         return self._armed_by_s is not None
 
     def confirms(self, question: AskOperator, *, moves_robot: bool) -> bool:
-        """Whether the pedal has confirmed the question since the last call; call it while the question is open."""
+        """Return whether the pedal has confirmed the question since the last call; call it while it is open."""
         if question != self._question:
             self._question, self._last, self._armed_by_s = question, None, None
         before = self._last
@@ -77,7 +77,7 @@ class Pedal:
         return self._lets_move(before, now) if moves_robot else True
 
     def _lets_move(self, before: _Looked, now: _Looked) -> bool:
-        """Whether this press is the second of two. `now` counts one press more than `before`."""
+        """Return whether this press is the second of two. `now` counts one press more than `before`."""
         pressed_s = now.reading.pressed_s
         if pressed_s is None or now.reading.now_s is None:
             self._tell_once(
@@ -99,7 +99,7 @@ class Pedal:
         return False
 
     def _in_time(self, before: _Looked, now: _Looked) -> bool:
-        """Whether a reading came in time, by both clocks; otherwise the pedal is disarmed."""
+        """Return whether a reading came in time, by both clocks; otherwise disarm the pedal."""
         by_host_s = now.at_s - before.at_s
         if by_host_s > LATE_S:
             self._disarm(f"the light box answered {by_host_s:.1f} s after the reading before")

@@ -10,7 +10,7 @@ _FIELDS = re.compile(r"^(Name|Version):[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 
 
 def software_versions() -> dict[str, str]:
-    """Every installed distribution and its version, sorted by name; as this process found them first."""
+    """Return every installed distribution and its version, sorted by name; as this process found them first."""
     return dict(_installed())
 
 
@@ -21,7 +21,7 @@ def _installed() -> tuple[tuple[str, str], ...]:
 
 
 def _named(distribution: Distribution) -> tuple[str, str]:
-    """Name and version; the metadata's other fields, which are long, are not parsed."""
+    """Return the name and version; the metadata's other fields, which are long, are not parsed."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     header = text.replace("\r\n", "\n").partition("\n\n")[0]
     fields = dict(reversed(_FIELDS.findall(header)))

@@ -29,14 +29,14 @@ from service.store.store import Store
 
 @dataclass(frozen=True)
 class ClockWatch:
-    """Checks the recorded clock offsets and tells of those beyond their limits."""
+    """Checks the recorded clock offsets and reports those beyond their limits."""
 
     follower: RunFollower
     tell: Callable[[str], None]
     _told: set[str] = field(init=False, default_factory=set[str])
 
     def look(self) -> None:
-        """Tell of each clock beyond its limit that has not been told of yet."""
+        """Report each clock beyond its limit that has not been reported yet."""
         for reading in clock_readings(self.follower.now().events):
             if reading.within is False and reading.device not in self._told:
                 self._told.add(reading.device)
@@ -44,12 +44,12 @@ class ClockWatch:
 
 
 _FORECAST_EVERY_S = 30.0
-_LOOK_EVERY_S = 2.0  # in this time a camera cannot fill the space that is kept free
+_LOOK_EVERY_S = 2.0  # in this time a camera cannot fill the space that is reserved
 
 
 @dataclass
 class DiskWatch:
-    """Forecasts whether the disk has room for the rest of the run; records and tells a forecast that is worse."""
+    """Forecasts whether the disk has room for the rest of the run; records and reports a forecast that is worse."""
 
     run: HeldRun
     protocol: Protocol
@@ -74,7 +74,7 @@ class DiskWatch:
         self._due_s = now_s + _LOOK_EVERY_S
 
     def forecast(self) -> Forecast:
-        """Make a forecast; record it and tell the operator if it is worse than the one before."""
+        """Make a forecast; record it and report it to the operator if it is worse than the one before."""
         state = self.run.refresh()
         found = forecast_of(self.run.store, self.protocol, state)
         worse = found.verdict not in ("enough", self._told)
@@ -92,7 +92,7 @@ class DiskWatch:
 # its collections became longer with every viewpoint.
 @contextmanager
 def short_collections() -> Generator[None]:
-    """Within this block, a full collection visits only what was made since the one before.
+    """Let full collections in this block visit only what was made since the one before.
 
     What was there before, or survives a full collection, is not visited again. It is still freed when its last
     reference goes; only a cycle that becomes garbage later stays in memory, until the end of the block.
@@ -132,7 +132,7 @@ class Seal:
     def sign(self, *, ended: bool) -> None:
         """Sign the chain's end and, if the run has `ended`, have the signature stamped.
 
-        The operator is told of a failure; nothing is raised: the next signature covers the same events.
+        A failure is reported to the operator; nothing is raised: the next signature covers the same events.
         """
         self.busy("signing the record")
         try:
@@ -145,7 +145,7 @@ class Seal:
             self._tell_of_the_place(away)
 
     def _tell_of_the_place(self, away: Away | None) -> None:
-        """Tell the operator, and record that the second place is away; a run goes on without it."""
+        """Inform the operator, and record that the second place is away; a run goes on without it."""
         self._away = away
         if away is None:
             self.tell("the second place of the signatures is up to date again")

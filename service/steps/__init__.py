@@ -15,7 +15,7 @@ GROUP = "orthocapture.steps"  # entry points of plug-ins; each names a StepKind
 
 @cache
 def step_kinds() -> Mapping[str, StepKind[Any]]:
-    """All step kinds by name: those of service/steps/kinds, and those of plug-ins.
+    """Return all step kinds by name: those of service/steps/kinds, and those of plug-ins.
 
     Raises:
         ConfigurationError: two declare the same name, or an entry point names something that is not a StepKind; also
@@ -36,5 +36,5 @@ class _ParamsModels(Mapping[str, type[StepParams]]):
 
 
 def params_models() -> Mapping[str, type[StepParams]]:
-    """The Params model of every step kind, for the protocol loader; raises what `step_kinds` does."""
+    """Return the Params model of every step kind, for the protocol loader; raises what `step_kinds` does."""
     return _ParamsModels()

@@ -21,7 +21,7 @@ from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact
 
 T = TypeVar("T")
-_LASTING_S = 3.0  # how long the words must have stayed the same before they are shown
+_LASTING_S = 3.0  # how long the text must have stayed the same before it is shown
 
 
 def wait_for(
@@ -37,14 +37,14 @@ def wait_for(
     is being written is no fault.
 
     Args:
-        context: of the step.
-        find: looks for what is wanted, oldest first.
-        wait_s: longest wait.
-        what: what is waited for, in words.
-        report: of the device, with its problems.
+        context: the step's surroundings: devices, evidence, clock.
+        find: returns what is wanted, oldest first.
+        wait_s: the longest wait.
+        what: the name of what is awaited, for people.
+        report: returns the device's report, with its problems.
 
     Raises:
-        DeviceTimeoutError: after `wait_s`.
+        DeviceTimeoutError: nothing was found in `wait_s`.
     """
     look_s = context.monotonic_s()
     deadline_s = look_s + wait_s
@@ -91,7 +91,7 @@ def keep_clean(
     """Copy files of a CT suite into the evidence, without what may name people, and note what was removed.
 
     The copies have new names, since the old ones may name people too. The note on each copy has the SHA-256 of its
-    original. If the rig keeps files as they are, they are kept unchanged.
+    original. If the rig says that files stay as they are, they are copied unchanged.
 
     Raises DataError as `keep` does, and UnreadableFileError if a file cannot be copied so.
     """
@@ -181,5 +181,5 @@ def _record(context: StepContext, ref: ArtefactRef, device: str, note: str) -> N
 
 
 def layout_uncertainties(layout: JudgedLayout | None) -> dict[str, Uncertainty]:
-    """The uncertainty of each measure of a layout; empty where it was not judged (None)."""
+    """Return the uncertainty of each measure of a layout; empty where it was not judged (None)."""
     return {} if layout is None else dict(layout.bounds)

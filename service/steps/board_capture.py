@@ -70,7 +70,7 @@ class BoardCapture:
     # --- the loop ---
 
     def take(self) -> dict[str, float]:
-        """Capture, search and plan until nothing is missing; the measures of the capture."""
+        """Capture, search and plan until nothing is missing; return the measures of the capture."""
         begun = False
         while True:
             fresh = self.poses() if not begun else self._new
@@ -85,7 +85,7 @@ class BoardCapture:
             self._new = planned
 
     def poses(self) -> tuple[Viewpoint, ...]:
-        """All poses of the step so far."""
+        """Return all poses of the step so far."""
         return (*self.given, *self._recorded())
 
     def _recorded(self) -> tuple[Viewpoint, ...]:
@@ -122,7 +122,7 @@ class BoardCapture:
         return self._rest(looks)
 
     def _planned(self) -> int:
-        """Number of poses planned so far, without replacements."""
+        """Return the number of poses planned so far, without replacements."""
         return sum(len(plan.poses) for plan in self._plans if plan.why != "replacement")
 
     def _rest(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
@@ -141,11 +141,11 @@ class BoardCapture:
 
         Args:
             count: the most poses to add.
-            enough: from the predictions without and with further poses, whether these are enough.
-            advise: the advice to the operator, from the number of poses, their names and their prediction in words.
+            enough: says from the predictions without and with further poses if these are enough.
+            advise: returns the advice to the operator for a number of poses, their names and the predicted result.
 
         Returns:
-            whether any pose was found.
+            True if any pose was found.
         """
         looks = self.looks()
         return bool(self._plan("mend", count, looks, enough=enough, advise=advise))
@@ -159,7 +159,7 @@ class BoardCapture:
         enough: Callable[[PlanPrediction, PlanPrediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
     ) -> tuple[Viewpoint, ...]:
-        """Plan board poses, record them and tell the operator; none if the arm can reach no other useful pose."""
+        """Plan board poses, record and report them; none if the arm can reach no other useful pose."""
         self.context.progress("planning board poses", 0, 1)
         self.context.busy("planning board poses")
         known = self._knowledge(looks)
@@ -186,7 +186,7 @@ class BoardCapture:
         from_images: int,
         advise: Callable[[int, str, str], str] | None,
     ) -> None:
-        """Record planned poses with what they are predicted to give, and tell the operator."""
+        """Record planned poses with what they are predicted to give, and report them to the operator."""
         prediction = prediction_record(predicted)
         words = describe_prediction(prediction, self.solve)
         names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
@@ -211,7 +211,7 @@ class BoardCapture:
         self._plans.append(plan)
 
     def planner(self, known: BoardKnowledge, *, coverage: float) -> Planner:
-        """The planner for this station."""
+        """Return the planner for this station."""
         layout = self.context.devices.layout(self.wanted.station)
         return Planner(
             self.wanted,
@@ -223,7 +223,7 @@ class BoardCapture:
         )
 
     def _feasible(self, known: BoardKnowledge) -> Callable[[Transform], bool]:
-        """Whether the arm can reach T_base_camera; always, for an arm of unknown kinematics."""
+        """Return a test if the arm can reach T_base_camera; it is always true for an arm of unknown kinematics."""
         arm = arm_at_station(self.context, self.wanted.station, self._mount)
         if arm is None:
             return lambda _T: True
@@ -232,7 +232,7 @@ class BoardCapture:
         return lambda T: best_posture(T, scene) is not None
 
     def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
-        """The images that show the board, and the planned poses without an image."""
+        """Return the images that show the board, and the planned poses without an image."""
         seen = [look for look in looks if look.seen and look.view is not None]
         poses = np.array([np.array(look.capture.T_base_flange) @ known.T_flange_camera for look in seen])
         pixels = tuple(look.view.corners for look in seen if look.view is not None)
@@ -246,7 +246,7 @@ class BoardCapture:
     # --- what is known ---
 
     def knowledge(self) -> BoardKnowledge:
-        """The estimate of camera, mount and board from all images so far, including those of earlier attempts."""
+        """Estimate camera, mount and board from all images so far, including those of earlier attempts."""
         return self._knowledge(self.looks())
 
     def _knowledge(self, looks: Sequence[SearchedBoardImage]) -> BoardKnowledge:
@@ -301,7 +301,7 @@ class BoardCapture:
         capture_viewpoints(self.context, task)
 
     def looks(self, *, wait: bool = True) -> list[SearchedBoardImage]:
-        """Every valid image with what was found in it; with `wait`, once all have been searched."""
+        """Return every valid image with what was found in it; with `wait`, once all have been searched."""
         if wait:
             self._looks.wait()
         return self._looks.of(self.context.step.id)
@@ -350,7 +350,7 @@ def _middle(known: BoardKnowledge, board: Board) -> Array:
 
 
 def _same_base(before: Sequence[SearchedBoardImage], station: str, seen: Sequence[SearchedBoardImage]) -> bool:
-    """Whether an earlier step's images were taken from this station."""
+    """Return whether an earlier step's images were taken from this station."""
     return all(look.capture.station == station for look in (*before, *seen))
 
 
@@ -395,7 +395,7 @@ def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapp
 
 
 def _wanted(failed: Sequence[GateVerdict], measures: Mapping[str, float]) -> tuple[int, list[Enough]]:
-    """The most poses to add, and the rules that say when they are enough."""
+    """Return the most poses to add, and the rules that say when they are enough."""
     least, most, rules = 1, _MOST, list[Enough]()
     for verdict in failed:
         name, value = verdict.measure, verdict.value
@@ -410,7 +410,7 @@ def _wanted(failed: Sequence[GateVerdict], measures: Mapping[str, float]) -> tup
 
 
 def _rule(name: str, value: float | None, low: float | None, high: float | None) -> Enough:
-    """A rule: whether a predicted number reaches the gate.
+    """Return a rule that says if a predicted number reaches the gate.
 
     For uncertainties, the measured value is scaled by the predicted ratio of after to before.
     """

@@ -63,7 +63,7 @@ class BoardLooks:
             self.context.wait_for_results(0.05)
 
     def of(self, step: str) -> list[SearchedBoardImage]:
-        """Every valid image of a step that has been searched, with what was found."""
+        """Return every valid image of a step that has been searched, with what was found."""
         jobs = self._by_image(step)
         spoilt = why_spoilt(self._looked_at(step))
         out: list[SearchedBoardImage] = []
@@ -84,7 +84,7 @@ class BoardLooks:
         return out
 
     def spoilt_in_a_row(self) -> list[ImageSharpness]:
-        """The blurred or black images at the end of this step, if there are so many that the capture must stop.
+        """Return the blurred or black images at this step's end, if there are so many that the capture must stop.
 
         Empty if all images so far are black: then the search for the first board reports it.
         """
@@ -107,7 +107,7 @@ class BoardLooks:
         return {image_of(j).sha256: j for j in self._jobs(step) if j.status != "enqueued"}
 
     def _looked_at(self, step: str) -> list[ImageSharpness]:
-        """The sharpness of the searched images, in the order of capture."""
+        """Return the sharpness of the searched images, in the order of capture."""
         jobs = self._by_image(step)
         ordered = [jobs.get(capture.artefacts[0].sha256) for capture in self.context.evidence.captures(step)]
         done = [(j, _answer_of(j)) for j in ordered if j is not None and j.status == "finished"]
@@ -150,5 +150,5 @@ class BoardFields(TypedDict):
 
 
 def board_arguments(board: Board) -> BoardFields:
-    """The fields of a job's arguments for a board."""
+    """Return the fields of a job's arguments for a board."""
     return {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}

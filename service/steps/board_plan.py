@@ -50,12 +50,12 @@ class Planner:
     """Plans board poses at one station.
 
     Attributes:
-        wanted: by the protocol.
-        board: to be photographed.
-        aims: calibrations that the images are for.
+        wanted: the protocol's section on board poses.
+        board: the board to be photographed.
+        aims: the calibrations that the images are for.
         approach: (3,) horizontal unit vector from the scene towards the arm's base.
         nominal_mount: T_flange_camera according to the drawing.
-        feasible: whether the arm can reach a T_base_camera given for the nominal mount.
+        feasible: says if the arm can reach a T_base_camera given for the nominal mount.
     """
 
     wanted: BoardPoses
@@ -75,7 +75,7 @@ class Planner:
         enough: Callable[[PlanPrediction], bool] | None = None,
         seed: int = 0,
     ) -> PlannedBoard:
-        """Up to `count` further poses; fewer if the arm can reach no others that show the board."""
+        """Plan up to `count` further poses; fewer if the arm can reach no others that show the board."""
         wishes = FIRST if why == "first" else self.wanted.wishes
         problem = self._problem(known)
         poses = np.zeros((0, 4, 4))
@@ -93,11 +93,11 @@ class Planner:
         return PlannedBoard(poses, predicted)
 
     def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> PlanPrediction:
-        """The prediction without further images."""
+        """Return the prediction without further images."""
         return self._problem(known).predict(taken)
 
     def with_planned(self, taken: ChosenViews, T_base_camera: Array, known: BoardKnowledge) -> ChosenViews:
-        """The images with those added that are planned but not taken yet."""
+        """Return the images with those added that are planned but not taken yet."""
         future = self._problem(known).as_taken(T_base_camera)
         return taken.plus(future.T_base_camera, future.pixels)
 
@@ -105,12 +105,12 @@ class Planner:
         return DesignProblem(known, self.board, self.aims)
 
     def sent(self, T_base_camera: Transform, known: BoardKnowledge) -> Transform:
-        """T_base_camera for the nominal mount, if the camera is to be at T_base_camera with the estimated mount."""
+        """Return T_base_camera for the nominal mount that puts the camera at this one with the estimated mount."""
         return T_base_camera @ inverse(known.T_flange_camera) @ self.nominal_mount
 
 
 def preview_board(planner: Planner, known: BoardKnowledge) -> PlannedBoard:
-    """All poses as they would be planned if camera, mount and board were as stated, before anything has moved.
+    """Return all poses as they would be planned if camera, mount and board were as given, before anything has moved.
 
     After the first pose, the place of the board counts as measured.
     """
@@ -130,7 +130,7 @@ def _as_if_measured(known: BoardKnowledge) -> BoardKnowledge:
 def nominal_board(
     wanted: BoardPoses, board: Board, layout: StationLayout, mount: Transform, camera: CameraModel, focal: float
 ) -> BoardKnowledge:
-    """Board, mount and lens as protocol and rig file state them."""
+    """Return board, mount and lens as protocol and rig file give them."""
     tolerances = Tolerances(
         place_m=metres(wanted.place_tolerance_mm), turn_rad=float(np.radians(wanted.turn_tolerance_deg)), focal=focal
     )
@@ -142,11 +142,11 @@ def nominal_board(
 
 
 def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None) -> tuple[CameraModel, float]:
-    """Nominal intrinsics without distortion, and the relative uncertainty of the focal length.
+    """Return nominal intrinsics without distortion, and the relative uncertainty of the focal length.
 
     Args:
-        lens: of the rig file; None: a common focal length with a large uncertainty.
-        size: of the images, px; None: as the rig file states it.
+        lens: the lens of the rig file; None: a common focal length with a large uncertainty.
+        size: width and height of the images, px; None: as the rig file gives them.
     """
     width, height = size or (lens.image_px if lens is not None else (1800, 1200))
     if lens is None:
@@ -157,7 +157,7 @@ def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None
 
 
 def prediction_record(prediction: PlanPrediction) -> BoardPrediction:
-    """The prediction as it is recorded: rounded, and without NaN."""
+    """Return the prediction as it is recorded: rounded, and without NaN."""
 
     def number(value: float, digits: int = 4) -> float | None:
         return round(value, digits) if np.isfinite(value) else None
@@ -174,7 +174,7 @@ def prediction_record(prediction: PlanPrediction) -> BoardPrediction:
 
 
 def describe_prediction(predicted: BoardPrediction, solve: Sequence[str]) -> str:
-    """`coverage 99 %, uncertainty of a projected point 0.006 mm, tilts to 40°`: what a plan is predicted to give."""
+    """Describe what a plan will give: `coverage 99 %, uncertainty of a projected point 0.006 mm, tilts to 40°`."""
     parts = [f"coverage {100 * predicted.coverage:.0f} %"]
     if "intrinsics" in solve and predicted.uncertainty_mm is not None:
         parts.append(f"uncertainty of a projected point {predicted.uncertainty_mm:.3f} mm")

@@ -11,7 +11,7 @@ from service.core.records.base import Elapsed, Moment, elapsed
 from service.core.run.state import RunState
 from service.steps.kinds import scan_import, timed_application
 
-_SHOWN_S = 60.0  # the time left is told in whole minutes
+_SHOWN_S = 60.0  # the time left is shown in whole minutes
 _CLOSE_S, _SHOWN_CLOSE_S = 300.0, 10.0  # and in steps of ten seconds when there is little of it
 
 
@@ -20,12 +20,12 @@ class Coat:
     """A coat on the specimen, while a scan of it is still to come.
 
     Attributes:
-        product: what was applied.
-        scan: title of the step that imports the scan.
-        within_s: age at which the scan must have arrived: the limit of that step's gate, else of the application.
-        gated: whether a gate of the protocol judges the age.
-        sublimates_after_s: age at which it has disappeared.
-        age: as the gate will judge it; not known where the clocks contradict each other.
+        product: the name of what was applied.
+        scan: the title of the step that imports the scan.
+        within_s: the age at which the scan must have arrived: the limit of that step's gate, else of the application.
+        gated: true if a gate of the protocol judges the age.
+        sublimates_after_s: the age at which it has disappeared.
+        age: the age as the gate will judge it; not known where the clocks contradict each other.
         at_utc: the time for which this holds.
     """
 
@@ -52,7 +52,7 @@ class Coat:
 
     @property
     def title(self) -> str:
-        """The time left in a few words."""
+        """The time left as a short text."""
         left_s = self.left_s
         if left_s is None:
             return f"Coat of {self.product}: how old it is cannot be known."
@@ -62,7 +62,7 @@ class Coat:
 
     @property
     def text(self) -> str:
-        """What that means for the scan."""
+        """The consequence of the coat's age for the scan, as a sentence."""
         limit = f"{self.within_s / 60:g} min"
         if self.age.seconds is None:
             then = f" The limit of {limit} will not count as met." if self.gated else ""
@@ -77,7 +77,7 @@ class Coat:
 
 
 def coats(protocol: Protocol, state: RunState, now: Moment) -> tuple[Coat, ...]:
-    """The coats that are on the specimen while the scan that needs them has not passed."""
+    """Return the coats that are on the specimen while the scan that needs them has not passed."""
     if state.terminal:
         return ()
     found: list[Coat] = []
@@ -104,7 +104,7 @@ def coats(protocol: Protocol, state: RunState, now: Moment) -> tuple[Coat, ...]:
 
 
 def _scan_of(protocol: Protocol, application: Step) -> Step | None:
-    """The step that imports the scan of a coat: the one that names it, else the next one."""
+    """Return the step that imports the scan of a coat: the one that names it, else the next one."""
     later = protocol.steps[protocol.index(application.id) + 1 :]
     scans = [(step, step.params) for step in later if isinstance(step.params, scan_import.Params)]
     named = [step for step, params in scans if params.application == application.id]
@@ -112,7 +112,7 @@ def _scan_of(protocol: Protocol, application: Step) -> Step | None:
 
 
 def _limit_s(scan: Step) -> float | None:
-    """The largest age that the step's gate allows; None without such a gate."""
+    """Return the largest age that the step's gate allows; None without such a gate."""
     if not isinstance(scan.params, scan_import.Params) or scan.params.application is None:
         return None
     limits = [gate.max for gate in scan.gates if gate.measure == scan_import.AGE and gate.max is not None]
@@ -120,7 +120,7 @@ def _limit_s(scan: Step) -> float | None:
 
 
 def _left(seconds: float) -> str:
-    """`33 min`, and `4 min 10 s` when it is little; never more than is left."""
+    """Return `33 min`, and `4 min 10 s` when it is little; never more than is left."""
     if seconds >= _CLOSE_S:
         return f"{math.floor(seconds / _SHOWN_S)} min"
     shown_s = int(math.floor(seconds / _SHOWN_CLOSE_S) * _SHOWN_CLOSE_S)

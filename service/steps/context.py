@@ -51,9 +51,9 @@ class StationLayout:
     robot: str  # device name in rig.yaml
     scene_centre_m: tuple[float, float, float]
     approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
-    obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # what else stands there, by name
+    obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # the other things that stand there, by name
     is_arm: bool = True  # not axes of another kind, whose motions are not planned
-    abandoned: Abandoned | None = None  # what becomes of a motion whose program died, if the driver's section says so
+    abandoned: Abandoned | None = None  # the end of a motion whose program died, if the driver's section says so
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class LeaveToMove:
     `not_before_monotonic_s` is a time of the host's monotonic clock before the confirmation was given.
     """
 
-    seq: int  # of its event
+    seq: int  # its event
     by: str
     not_before_monotonic_s: float
 
@@ -92,50 +92,50 @@ class Devices(Protocol):
     """The open devices of a rig, by role; opened on first use. Raises ConfigurationError if the rig has none."""
 
     def robot(self, station: str) -> RobotArm:
-        """The arm at a station, configured with its payload, and free to move if a person has confirmed it.
+        """Return the arm at a station, configured with its payload, and free to move if a person has confirmed it.
 
         Raises SafetyStopError or LeaveNeededError if it was stopped after that confirmation.
         """
         ...
 
     def camera(self) -> Camera:
-        """The first camera: the one on the arm, or the only one."""
+        """Return the first camera: the one on the arm, or the only one."""
         ...
 
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
-        """The further cameras of the rig, in the order of the rig file; mostly none."""
+        """Return the further cameras of the rig, in the order of the rig file; mostly none."""
         ...
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The scanner of this name; without a name, the only one."""
+        """Return the scanner of this name; without a name, the only one."""
         ...
 
     def ct(self) -> CtSource:
-        """The folder in which the CT suite puts its files."""
+        """Return the folder in which the CT suite puts its files."""
         ...
 
     def lightbox(self) -> Lightbox | None:
-        """The light and environment box, if the rig has one."""
+        """Return the light and environment box, if the rig has one."""
         ...
 
     def layout(self, station: str) -> StationLayout:
-        """Which arm and scene a station has."""
+        """Return the arm and the scene of a station."""
         ...
 
     def nominal_T_flange_camera(self) -> Transform:
-        """(4, 4) The camera on the flange according to the drawing of the mount, metres."""
+        """Return the camera's pose on the flange (4, 4) according to the drawing of the mount, metres."""
         ...
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
-        """Obstacles that the arm must avoid, and the lens if the rig file describes it."""
+        """Return the obstacles that the arm must avoid, and the lens if the rig file describes it."""
         ...
 
     def lens(self) -> LensSection | None:
-        """Focal length and sensor as the rig file states them, if it does."""
+        """Return focal length and sensor as the rig file gives them, if it does."""
         ...
 
     def imported(self) -> ImportList | None:
-        """The files to import, in a run that imports what was captured earlier; None in a run that captures."""
+        """Return the files to import, in a run that imports an earlier capture; None in a run that captures."""
         ...
 
     def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
@@ -143,7 +143,7 @@ class Devices(Protocol):
         ...
 
     def let_move(self, leave: LeaveToMove) -> None:
-        """Let the arms move: each arm is told once, when `robot` next asks for it."""
+        """Let the arms move: each arm gets the leave once, when `robot` next asks for it."""
         ...
 
     def reopen(self, device: Device) -> None:
@@ -151,11 +151,11 @@ class Devices(Protocol):
         ...
 
     def hold_arms(self) -> None:
-        """Stop and close every open arm: it moves again only after it is opened anew and a person has confirmed."""
+        """Stop and close every open arm: it moves again only after it is reopened and a person has confirmed."""
         ...
 
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
-        """The connections to arms that have ended since the last call, in order."""
+        """Return the connections to arms that have ended since the last call, in order."""
         ...
 
 
@@ -176,15 +176,15 @@ class JobRequest:
         references: Mapping[str, Reference | Each | None] = _NO_REFERENCES,
         priority: int = WAITED,
     ) -> JobRequest:
-        """A request with typed arguments.
+        """Return a request with typed arguments.
 
         Args:
-            kind: of the job.
-            arguments: with values, also where they come from earlier jobs.
-            references: field of the arguments (`camera`, `registrations/colmap`, `further_arms/0/arm_correction`) →
-                the reference that is recorded instead of its value; None where no job computed the value, which is
-                then recorded itself.
-            priority: see service.core.run.state.
+            kind: the job's kind.
+            arguments: the values, also where they come from earlier jobs.
+            references: the reference that is recorded instead of a value, by the argument's field (`camera`,
+                `registrations/colmap`, `further_arms/0/arm_correction`); None where no job computed the value;
+                the value itself is then recorded.
+            priority: the job's priority (service.core.run.state).
         """
         recorded = arguments.plain()
         for path, reference in references.items():
@@ -208,7 +208,7 @@ class JobResult:
 
     @classmethod
     def of(cls, job: JobState) -> Self:
-        """The answer of a finished job."""
+        """Return the answer of a finished job."""
         return cls(job.job, job.measures, job.artefacts, job.result)
 
     @property
@@ -218,7 +218,7 @@ class JobResult:
 
 
 class Evidence(Protocol):
-    """Where a step records what happens. It raises if recording fails, so that nothing is done unrecorded."""
+    """A step's access to the record. It raises if recording fails, so that nothing is done unrecorded."""
 
     def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "") -> None:
         """Append events (and artefact rows) in one transaction."""
@@ -233,15 +233,15 @@ class Evidence(Protocol):
         ...
 
     def path(self, ref: ArtefactRef) -> Path:
-        """The file that holds an artefact."""
+        """Return the file that holds an artefact."""
         ...
 
     def holds(self, sha256: str) -> bool:
-        """Whether a file with these bytes is in the evidence of this run already."""
+        """Return whether a file with these bytes is in the evidence of this run already."""
         ...
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
-        """The valid captures of a step's current attempt, up to this moment, in order."""
+        """Return the valid captures of a step's current attempt, up to this moment, in order."""
         ...
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
@@ -253,19 +253,19 @@ class Evidence(Protocol):
         ...
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """What people have asked of this step on the pages so far, in order."""
+        """Return the requests of people to this step on the pages so far, in order."""
         ...
 
     def computing(self) -> bool:
-        """Whether a worker computes a job of this run at this moment."""
+        """Return whether a worker computes a job of this run at this moment."""
         ...
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
-        """The jobs of a step in their present state, in the order in which they were enqueued."""
+        """Return the jobs of a step in their present state, in the order in which they were enqueued."""
         ...
 
     def state(self) -> RunState:
-        """The present state of the run."""
+        """Return the present state of the run."""
         ...
 
     def require_space(self) -> None:
@@ -289,10 +289,10 @@ class StepContext:
     wait: Callable[[float], None]
     operator: str
     tell: Callable[[str], None]  # one line of news for the operator
-    moment: Callable[[], Moment]  # now, in both clocks: for times that are kept and compared later
+    moment: Callable[[], Moment]  # now, in both clocks: for times that are stored and compared later
     # Surrounds each motion of an arm; raises StepInterruptedError if nobody has let it move for too long.
     motion: Callable[[], AbstractContextManager[None]]
-    wait_for_results: Callable[[float], None]  # as `wait`, where jobs are waited for
+    wait_for_results: Callable[[float], None]  # does the same as `wait`, where jobs are awaited
     busy: Callable[[str], None] = lambda _what: None  # call before a long call, with what it does
 
     @property
@@ -307,7 +307,7 @@ class StepContext:
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """What a step measured (gates judge it), the files it produced, its Result, and the jobs that computed them.
+    """A step's measures (gates judge them), the files it produced, its Result, and the jobs that computed them.
 
     Audit and replay follow `computed_by` from a step's numbers to the jobs: name each job whose measures are given.
     """
@@ -321,7 +321,7 @@ class StepOutcome:
 
 @dataclass(frozen=True, slots=True)
 class BeforeStep:
-    """What a kind's announcement may mention: title, number of images still to take, and stations."""
+    """The facts that a kind's announcement may mention: title, number of images still to take, and stations."""
 
     title: str
     views_left: int
@@ -329,17 +329,17 @@ class BeforeStep:
 
     @property
     def at_stations(self) -> str:
-        """` at station 1`, or "" without stations."""
+        """The phrase ` at station 1`, or "" without stations."""
         return f" at {self.stations}" if self.stations else ""
 
     def images(self, of: str = "") -> str:
-        """`1 image`, `8 images of the board`."""
+        """Return `1 image`, `8 images of the board`."""
         return f"{self.views_left} {'image' if self.views_left == 1 else 'images'}{of}"
 
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """What a confirmation starts: the text of its button after `Confirm: `, and a line below it."""
+    """The effect of a confirmation: the text of its button after `Confirm: `, and a line below it."""
 
     does: str
     below: str = "Nothing moves."
@@ -353,15 +353,15 @@ class StepKind(Generic[P]):
     """One kind of step, declared once.
 
     Attributes:
-        name: in the protocol.
-        params: its section of the protocol.
-        measures: the numbers that it yields, for gates.
-        result: what it leaves to later steps.
-        execute: does it.
+        name: the kind's name in the protocol.
+        params: the type of its section of the protocol.
+        measures: the type of the numbers that it yields, for gates.
+        result: the type of what it leaves to later steps.
+        execute: does the step.
         registered_by: the step whose registrations the measures are of, where they are RegistrationMeasures; None:
             this step itself.
-        words: what a person reads before confirming it.
-        drawing: shown beside the instructions if the protocol names no other: the name of one in
+        words: returns what a person reads before confirming it.
+        drawing: the drawing beside the instructions if the protocol names no other: the name of one in
             service/web/run/drawings, or, for a kind of a plug-in, an SVG itself (`<svg …`).
     """
 

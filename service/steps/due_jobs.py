@@ -27,12 +27,12 @@ class _Evaluated(JobRecord):
 
 
 def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None) -> dict[str, Task]:
-    """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration.
+    """Return the evaluation jobs of registrations that arrived after the step's own evaluation, by registration.
 
     Args:
-        state: of the run.
+        state: the run's state.
         step: the evaluation.
-        found: the jobs of the registration step that it evaluates, as recorded; None if that has not begun them.
+        found: the recorded jobs of the registration step that it evaluates; None if that has not started them.
     """
     if step.gives != "accuracy" or state.steps[step.id].skipped:
         return {}
@@ -52,7 +52,7 @@ def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None
 
 
 def due(protocol: Protocol, state: RunState) -> list[NewJob]:
-    """All jobs that can be enqueued now because the results they need exist; none in an aborted run."""
+    """Return all jobs that can be enqueued now because the results they need exist; none in an aborted run."""
     if state.status == "aborted":
         return []
     jobs = early_matches(protocol, state)
@@ -68,7 +68,7 @@ def due(protocol: Protocol, state: RunState) -> list[NewJob]:
 
 
 def new_job(state: RunState, step: str, task: Task) -> NewJob:
-    """The job to enqueue for a task."""
+    """Return the job to enqueue for a task."""
     key = job_key(state, step, task.request.kind, task.name)
     request = task.request
     return NewJob(
@@ -130,7 +130,7 @@ class PendingResult:
 
 
 def duration_words(seconds: float) -> str:
-    """A duration rounded to the precision of an estimate: `20 s`, `4 min`."""
+    """Return a duration rounded to the precision of an estimate: `20 s`, `4 min`."""
     if seconds < 90:
         return f"{max(10, 10 * round(seconds / 10))} s"
     return f"{round(seconds / 60)} min"
@@ -139,14 +139,14 @@ def duration_words(seconds: float) -> str:
 def missing_results(
     protocol: Protocol, state: RunState, started_utc: Mapping[str, str], now_utc: str, cores: int
 ) -> list[PendingResult]:
-    """The planned results that have not arrived, in the order in which they are expected.
+    """Return the planned results that have not arrived, in the order in which they are expected.
 
     Args:
-        protocol: of the run.
-        state: of the run.
-        started_utc: when each job that is being computed now was started, by job id.
+        protocol: the run's protocol.
+        state: the run's state.
+        started_utc: the start of each job that is being computed now, by job id.
         now_utc: the present time.
-        cores: number of jobs computed in parallel.
+        cores: the number of jobs computed in parallel.
     """
     left: list[PendingResult] = []
     for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run
@@ -166,11 +166,11 @@ class _Work(JobRecord):
     pairs: tuple[tuple[str, str], ...] = ()
 
     def count(self, kind: str) -> int:
-        """Number of images, or of pairs."""
+        """Return the number of images, or of pairs."""
         return len(self.pairs if kind == match.KIND.name else self.images)
 
     def size(self, kind: str) -> float:
-        """The number, weighted by their pixels for jobs whose duration depends on them."""
+        """Return the number, weighted by their pixels for jobs whose duration depends on them."""
         return self.count(kind)
 
 
@@ -181,7 +181,7 @@ class _Search(_Work):
     reduced_to: tuple[int, int] | None = None
 
     def size(self, kind: str) -> float:
-        """The number, weighted by their pixels."""
+        """Return the number, weighted by their pixels."""
         if self.camera is None:
             return self.count(kind)
         width, height = self.reduced_to or (self.camera.width, self.camera.height)
@@ -194,7 +194,7 @@ def _work(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> _Work:
 
 @dataclass(frozen=True, slots=True)
 class _JobTimes:
-    """How long the jobs of a run take."""
+    """The durations of a run's jobs."""
 
     state: RunState
     started_utc: Mapping[str, str]
@@ -202,7 +202,7 @@ class _JobTimes:
     cores: int
 
     def seconds(self, task: Task) -> float:
-        """Seconds until a task is done, counted from its start; 0 if it is done."""
+        """Return the seconds until a task is done, counted from its start; 0 if it is done."""
         job = task.job
         if job is not None and job.status != "enqueued":
             return 0.0
@@ -215,7 +215,7 @@ class _JobTimes:
         return max(expected_s - max(0.0, gone_s), 0.1 * expected_s)  # negative: the clock was set back
 
     def expected_s(self, kind: str, work: _Work) -> float:
-        """Expected duration of a job, from the jobs of its kind in this run if there are any."""
+        """Return the expected duration of a job, from the jobs of its kind in this run if there are any."""
         jobs = jobs_of(self.state)
         ended = [job for job in jobs.values() if job.kind == kind and job.status == "finished"]
         done = [(job, _work(kind, job.arguments, jobs)) for job in ended]
@@ -237,7 +237,7 @@ def _left_of(
     found: RegistrationJobs,
     clock: _JobTimes,
 ) -> list[PendingResult]:
-    """The missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
+    """Return the missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
     wanted = WantedRegistrations.of(step.params)
     evaluations = {} if evaluation is None else evaluation_tasks(state, evaluation, found)
     free_s = [0.0] * clock.cores
@@ -283,6 +283,6 @@ _CHAINS = {
 
 
 def _rest(source: str, last: str) -> tuple[str, ...]:
-    """The kinds of jobs that follow the last one that is planned."""
+    """Return the kinds of jobs that follow the last one that is planned."""
     chain = (detect_spheres.KIND.name, *_CHAINS.get(source, ()), register.KIND.name)
     return chain[chain.index(last) + 1 :] if last in chain else ()

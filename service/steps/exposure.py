@@ -40,12 +40,12 @@ class FurtherImage:
 
     @property
     def rigid(self) -> bool:
-        """Whether the camera moves with the arm."""
+        """True if the camera moves with the arm."""
         return self.taken_by.section.mounted == "rigid"
 
 
 def settings_of(camera: FurtherCamera, wanted: CameraSettings) -> CameraSettings:
-    """The settings of a further camera: those of the protocol, except what its section in rig.yaml states."""
+    """Return the settings of a further camera: those of the protocol, except what its section in rig.yaml gives."""
     section = camera.section
     return replace(
         wanted,
@@ -57,7 +57,7 @@ def settings_of(camera: FurtherCamera, wanted: CameraSettings) -> CameraSettings
 
 
 def exposing_at(context: StepContext, viewpoint: Viewpoint, cameras: Sequence[FurtherCamera]) -> list[FurtherCamera]:
-    """The cameras that expose at a viewpoint: all but those that expose once at a station and have done so."""
+    """Return the cameras that expose at a viewpoint: all but those that expose once at a station and have done so."""
     seen = {
         exposure.device
         for capture in context.evidence.captures(context.step.id)
@@ -72,7 +72,7 @@ def exposing_at(context: StepContext, viewpoint: Viewpoint, cameras: Sequence[Fu
 def expose_further(
     cameras: Sequence[FurtherCamera], wanted: CameraSettings, folder: Path, expose: Expose
 ) -> tuple[FurtherImage, ...]:
-    """One image of each camera, one after the other. Raises DeviceError of the first that fails."""
+    """Take one image with each camera, one after the other. Raises DeviceError of the first that fails."""
     images: list[FurtherImage] = []
     for camera in cameras:
         inside = folder / camera.name  # of its own, because cameras may give files the same names
@@ -95,7 +95,7 @@ def keep_further(context: StepContext, further: FurtherImage) -> tuple[tuple[Art
 
 
 def files_of(context: StepContext, exposure: FurtherExposure) -> tuple[ArtefactRef, ...]:
-    """The files of an exposure to be recorded with it; the calibration only the first time."""
+    """Return the files of an exposure to be recorded with it; the calibration only the first time."""
     new = not context.evidence.holds(exposure.calibration.sha256)
     return (*exposure.artefacts, *((exposure.calibration,) if new else ()))
 
@@ -131,17 +131,17 @@ class _Tool(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """What an exposure at a viewpoint needs.
+    """The devices and settings that an exposure at a viewpoint needs.
 
     Attributes:
-        camera: takes the image.
-        robot: holds the camera, and streams its pose.
-        viewpoint: at which the arm stands.
-        settled: how it came to rest.
+        camera: the camera that takes the image.
+        robot: the arm that holds the camera, and streams its pose.
+        viewpoint: the viewpoint at which the arm stands.
+        settled: the report on how it came to rest.
         environment: light and temperature before the exposure.
-        wanted: settings of the protocol.
-        image_kind: artefact kind of the photograph.
-        further: cameras that expose after it, while the arm stands.
+        wanted: the protocol's settings.
+        image_kind: the artefact kind of the photograph.
+        further: the cameras that expose after it, while the arm stands.
     """
 
     camera: Camera
@@ -196,7 +196,7 @@ def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) 
 
 
 def _during(robot: RobotArm, image: CapturedImage, wanted: CameraSettings) -> tuple[RobotSample, ...]:
-    """The pose stream during an exposure."""
+    """Return the pose stream during an exposure."""
     began_s = image.trigger_monotonic_s
     return robot.samples(began_s, began_s + wanted.exposure_s + 0.3)
 
@@ -272,7 +272,7 @@ def _captured(context: StepContext, shot: Shot, refs: Sequence[ArtefactRef]) -> 
 
 
 def _tool(sample: RobotSample) -> _Tool:
-    """The tool that the controller held, as the event has it; it is the same in every sample of an exposure."""
+    """Return the tool that the controller held, as the event has it; all samples of an exposure have the same."""
     tool, payload = sample.T_flange_tcp, sample.payload
     return {
         "T_flange_tcp": None if tool is None else _rows(tool),
@@ -285,10 +285,10 @@ def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_
     """Release the shutter. While the camera is busy with an earlier image, try again for up to a minute.
 
     Args:
-        context: of the step.
-        camera: that takes the image.
-        folder: for its files.
-        was_busy: it was busy for a minute already: try for a few seconds only.
+        context: the step's surroundings: devices, evidence, clock.
+        camera: the camera that takes the image.
+        folder: the files' folder.
+        was_busy: true if it was busy for a minute already: then try for a few seconds only.
     """
     for pause_s in _BUSY_AGAIN_PAUSES_S if was_busy else _BUSY_PAUSES_S:
         try:
@@ -311,7 +311,7 @@ class ExposurePose:
 
 
 def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
-    """The pose of the flange during an exposure, from its samples, oldest first.
+    """Return the pose of the flange during an exposure, from its samples, oldest first.
 
     Raises DeviceUnavailableError if there are none.
     """
@@ -331,7 +331,7 @@ def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
 
 
 def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
-    """Whether an image's EXIF shows the protocol's settings: ISO exactly, aperture and time up to rounding."""
+    """Return whether an image's EXIF has the protocol's settings: ISO exactly, aperture and time up to rounding."""
     return (
         agrees(actual.aperture_f, wanted.aperture_f)
         and agrees(actual.exposure_s, wanted.exposure_s)
@@ -340,7 +340,7 @@ def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
 
 
 def wanted_settings(context: StepContext) -> CameraSettings:
-    """The camera settings of the protocol. Raises ConfigurationError if it has none."""
+    """Return the camera settings of the protocol. Raises ConfigurationError if it has none."""
     camera = context.protocol.camera
     if camera is None:
         raise ConfigurationError(
@@ -358,7 +358,7 @@ def wanted_settings(context: StepContext) -> CameraSettings:
 
 
 def environment_now(context: StepContext) -> dict[str, float]:
-    """Light and temperature from the light box; empty without one."""
+    """Read light and temperature from the light box; empty without one."""
     lightbox = context.devices.lightbox()
     if lightbox is None:
         return {}
@@ -394,7 +394,7 @@ def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[Robot
 
 
 def camera_record(image: CapturedImage) -> dict[str, object]:
-    """The camera's part of the event of an exposure."""
+    """Return the camera's part of the event of an exposure."""
     return {
         **dataclasses.asdict(image.exif),
         "counter": image.counter,

@@ -46,7 +46,7 @@ class EarlyFeatures:
 
     @classmethod
     def begin(cls, context: StepContext, plan: Sequence[Viewpoint]) -> EarlyFeatures | None:
-        """None if no registration of the protocol will match these images, or if the camera is not calibrated yet."""
+        """Prepare early features; None if no registration matches these images, or without a calibration."""
         registration = _registration_of(context.protocol, context.step.id)
         if registration is None:
             return None
@@ -88,7 +88,7 @@ class EarlyFeatures:
 
 
 def _registration_of(protocol: Protocol, capture: str) -> Step | None:
-    """The step that will register the images of a capture by their features."""
+    """Return the step that will register the images of a capture by their features."""
     for step in protocol.steps:
         if step.gives == "registrations":
             wanted = WantedRegistrations.of(step.params)
@@ -100,14 +100,14 @@ def _registration_of(protocol: Protocol, capture: str) -> Step | None:
 def _taken(
     context: StepContext, wanted: WantedRegistrations, station: str, nominal: Transform
 ) -> dict[str, Transform]:
-    """Approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
+    """Return the approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
     earlier = [step for step in wanted.captures if step != context.step.id]
     captures = [c for step in earlier for c in context.evidence.captures(step) if isinstance(c, ViewpointCaptured)]
     return {c.viewpoint: np.array(c.T_base_flange) @ nominal for c in captures if c.station == station}
 
 
 def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
-    """The matching jobs that are due: of each image with its planned neighbours, if both have features."""
+    """Return the matching jobs that are due: of each image with its planned neighbours, if both have features."""
     found: dict[str, tuple[str, JobState]] = {}
     pairs_done: set[tuple[str, str]] = set()
     matched: set[str] = set()
@@ -150,7 +150,7 @@ class EarlyJobs:
     matches: list[JobState] = field(default_factory=list[JobState])
 
     def matching(self, features: Mapping[str, str]) -> list[JobState]:
-        """The jobs that matched exactly these features; `features` maps viewpoints to hashes of files."""
+        """Return the jobs that matched exactly these features; `features` maps viewpoints to hashes of files."""
         return [
             job
             for job in self.matches
@@ -159,7 +159,7 @@ class EarlyJobs:
 
 
 def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: SfmEffort) -> EarlyJobs:
-    """The jobs that computed features and matches with this camera and effort while the images arrived."""
+    """Return the jobs that computed features and matches with this camera and effort while the images arrived."""
     early = EarlyJobs()
     for step in state.steps.values():
         for job in step.jobs.values():
@@ -182,11 +182,11 @@ def _asked_of(job: JobState) -> features.ImagesToMatch:
 
 
 def _image_of(job: JobState) -> ImageFile:
-    """The image of an early job on features, which has only one."""
+    """Return the image of an early job on features, which has only one."""
     return _asked_of(job).images[0]
 
 
 def chunks(items: Iterable[T], size: int) -> list[list[T]]:
-    """The items in order, in lists of at most `size`."""
+    """Return the items in order, in lists of at most `size`."""
     listed = list(items)
     return [listed[i : i + size] for i in range(0, len(listed), size)]

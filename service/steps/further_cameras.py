@@ -27,7 +27,7 @@ class ExposureFiles:
 
 
 def developed(context: StepContext, exposures: Sequence[ExposureFiles]) -> dict[str, str]:
-    """The developed raw file of each exposure of one camera, by viewpoint."""
+    """Return the developed raw file of each exposure of one camera, by viewpoint."""
     parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
     requests = [
         JobRequest.of(
@@ -54,14 +54,14 @@ def locate_further_cameras(
     *,
     on_raw: bool,
 ) -> Mapping[str, JobResult]:
-    """Locate each further camera that exposed in these capture steps; the worker's answers, by the camera's name.
+    """Locate each further camera that exposed in these capture steps; return the worker's answers by camera name.
 
     Args:
-        context: of the registration step.
-        images_of: capture steps.
+        context: the registration step's surroundings: devices, evidence, clock.
+        images_of: the capture steps' ids.
         outlines: the search for spheres in the first camera's images, which has the arguments on the spheres.
         registered: the finished job of each registration of those images.
-        on_raw: measure in developed raw files, for a camera that wrote one with every image.
+        on_raw: true to measure in developed raw files, for a camera that wrote one with every image.
     """
     exposures = sorted(_exposures(context, images_of), key=lambda exposure: exposure[1].device)
     requests = {
@@ -72,7 +72,7 @@ def locate_further_cameras(
 
 
 def _exposures(context: StepContext, images_of: Iterable[str]) -> list[tuple[str, FurtherExposure]]:
-    """(viewpoint, exposure) of every usable view."""
+    """Return (viewpoint, exposure) of every usable view."""
     return [
         (capture.viewpoint, exposure)
         for step in images_of
@@ -90,7 +90,7 @@ def _request(
     *,
     on_raw: bool,
 ) -> JobRequest:
-    """The job for one camera; its newest calibration counts."""
+    """Return the job for one camera; its newest calibration counts."""
     last = exposures[-1][1]
     recorded = outlines.arguments
     arguments: dict[str, object] = {

@@ -1,4 +1,4 @@
-"""Guides a capture by hand: its parameters and measures, what its jobs are given, and what the person is told."""
+"""Guides a capture by hand: its parameters and measures, what its jobs are given, and what the person reads."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ class Ring(Record):
     Azimuth 0 is the person's side at the first image, positive to the right. A range of 360° is a whole ring.
     """
 
-    tilt_deg: Annotated[float, Field(ge=0, le=60)]  # from the vertical
+    tilt_deg: Annotated[float, Field(ge=0, le=60)]  # the angle from the vertical
     azimuth_from_deg: float = -180.0  # start of the range
     azimuth_to_deg: float = 180.0  # end of the range
     count: Annotated[int, Field(ge=1, le=60)]  # places on the ring
-    distance_m: Annotated[float, Field(ge=0.2, le=2)]  # from the middle of the scene
+    distance_m: Annotated[float, Field(ge=0.2, le=2)]  # the distance from the middle of the scene
     aim_spread_m: Annotated[float, Field(ge=0, le=0.2)] = (
-        0.0  # of the aim point around the middle, for images of the board
+        0.0  # the aim point's distance from the middle, for images of the board
     )
 
     def azimuths_deg(self) -> list[float]:
-        """The azimuths of its places."""
+        """Return the azimuths of its places."""
         span = self.azimuth_to_deg - self.azimuth_from_deg
         whole = span >= 360.0
         if self.count == 1:
@@ -53,22 +53,22 @@ class Ring(Record):
 
 
 class Params(StepParams):
-    """What the images are for, and where they should be taken from."""
+    """The purpose of the images, and the places from which they should be taken."""
 
     by_hand: ClassVar = True
     repeated: ClassVar = RepeatedStep("Take the images that are missing or would help; the others are kept")
 
-    purpose: Literal["dataset", "control", "calibration"]  # what the images are for
-    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # where images are to be taken from
-    prefix: str = "h_"  # of the views' names
+    purpose: Literal["dataset", "control", "calibration"]  # the purpose of the images
+    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # the places from which images are to be taken
+    prefix: str = "h_"  # the beginning of the views' names
     min_images: Annotated[int, Field(ge=3)] = 12  # usable images that are needed at least
     max_images: Annotated[int, Field(ge=3)] = 200  # including unusable ones
     # Step with the intrinsics; not for images of the board.
     calibration: Annotated[str | None, NAMES_CALIBRATION] = None
     # Steps that locate the spheres, the best first: ct_import, layout_check.
     spheres_of: Annotated[tuple[str, ...], NAMES_SPHERES] = ()
-    sensor_width_mm: float = 35.7  # for images of the board, together with the focal length in the file
-    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
+    sensor_width_mm: float = 35.7  # the width for images of the board, together with the focal length in the file
+    coverage: CoverageRule = CoverageRule()  # rules by which a view counts for a point of the specimen's surface
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion
     pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # expected rotation error of structure from motion
     scan_sigma_mm: Annotated[float, Field(ge=0)] = 0.03  # expected error of the scan's own points, for predictions
@@ -81,12 +81,12 @@ class Params(StepParams):
 
     @property
     def photographs_specimen(self) -> bool:
-        """Whether the images are not of the calibration board."""
+        """True unless the images are of the calibration board."""
         return self.purpose != "calibration"
 
 
 class Measures(PredictedMeasures):
-    """Of the images so far."""
+    """The measures of the images so far."""
 
     images_taken: Annotated[Count, "photographs taken"] = None
     images_used: Annotated[Count, "photographs that can be used"] = None
@@ -97,7 +97,7 @@ class Measures(PredictedMeasures):
 
 
 class Result(Record):
-    """Which images are used."""
+    """The images that are used, and those that are not."""
 
     purpose: str
     used: tuple[str, ...]
@@ -113,16 +113,16 @@ class CommonArguments:
 
 
 def common_arguments(context: StepContext, params: Params) -> CommonArguments:
-    """The arguments that all jobs of the step have in common.
+    """Return the arguments that all jobs of the step have in common.
 
     Raises:
-        ConfigurationError: the protocol lacks the board, the calibration or the spheres that the images need.
+        ConfigurationError: the protocol does not name the board, the calibration or the spheres that the images need.
     """
     return _of_board(context, params) if params.purpose == "calibration" else _of_specimen(context, params)
 
 
 def _places(params: Params) -> tuple[hand_view.PlannedPlace, ...]:
-    """The places of the hemisphere."""
+    """Return the places of the hemisphere."""
     return tuple(
         hand_view.PlannedPlace(
             name=f"{ring.tilt_deg:02.0f}/{k + 1}",
@@ -207,7 +207,7 @@ def _of_specimen(context: StepContext, params: Params) -> CommonArguments:
 
 
 def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], bool, Reference | None]:
-    """The spheres of the first step in `spheres_of` that has them, whether they are rough, and the reference to them.
+    """Return the first spheres of the steps `spheres_of`, whether they are rough, and the reference to them.
 
     Spheres that were located in photographs alone are rough.
     """
@@ -225,7 +225,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
 
 
 def failure_words(job: JobState) -> str:
-    """Explains a failed job on the images: what it means, and what to do."""
+    """Explain a failed job on the images: what it means, and what to do."""
     why = job.message.rstrip(".")
     if job.kind == coverage_points.KIND.name:
         return (
@@ -240,7 +240,7 @@ def failure_words(job: JobState) -> str:
 
 @dataclass
 class Guide:
-    """Enqueues a job for one image after the other, and tells the person the result."""
+    """Enqueues a job for one image after the other, and shows the person the result."""
 
     context: StepContext
     params: Params
@@ -249,7 +249,7 @@ class Guide:
 
     @property
     def kind(self) -> str:
-        """Kind of the jobs."""
+        """The kind of the jobs."""
         return (hand_board if self.params.purpose == "calibration" else hand_view).KIND.name
 
     def begin(self) -> None:
@@ -266,7 +266,7 @@ class Guide:
         self._say(_answer_of(done[-1]).words if done else self.shared.values.first_words)
 
     def look(self) -> None:
-        """Tell the result of the last image, and enqueue the job for the next one. Returns at once."""
+        """Show the result of the last image, and enqueue the job for the next one. Returns at once."""
         jobs = {image_of(job).sha256: job for job in self._jobs()}
         for view in self._views():
             job = jobs.get(view.artefacts[0].sha256)
@@ -284,15 +284,15 @@ class Guide:
                 self.context.tell(failure_words(job))
 
     def __post_init__(self) -> None:
-        # The results of jobs that ended before a restart were told then.
+        # The results of jobs that ended before a restart were shown then.
         self._reported = {job.job for job in self._jobs() if job.status != "enqueued"}
 
     def images_used(self) -> int:
-        """Number of usable images so far."""
+        """Return the number of usable images so far."""
         return int(self._measures().get("images_used", 0))
 
     def enough(self) -> bool:
-        """Whether every image was analysed and the step's gates pass, or there are too many images."""
+        """Return whether every image was analysed and the step's gates pass, or there are too many images."""
         views = self._views()
         if len(self._answers()) + sum(job.status == "failed" for job in self._jobs()) < len(views):
             return False
@@ -304,7 +304,7 @@ class Guide:
         return evaluate_gates(self.context.step, self.context.attempt, measures, self.context.run.skipped).passed
 
     def outcome(self) -> StepOutcome:
-        """The outcome of the step."""
+        """Return the outcome of the step."""
         found = held_views(self.context, self.context.step.id)
         failed = {image_of(j).sha256: j.message for j in self._jobs() if j.status == "failed"}
         used: list[str] = []
@@ -424,5 +424,5 @@ class Guide:
 
 
 def _answer_of(job: JobState) -> hand_view.Answer:
-    """The answer of either kind of job: both answer alike."""
+    """Return the answer of either kind of job: both answer alike."""
     return hand_view.KIND.read_answer(job.result)

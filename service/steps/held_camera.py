@@ -80,7 +80,7 @@ class HeldCamera:
         return "camera", ()
 
     def _requests(self) -> list[By]:
-        """At most one request for a release, from a page or the pedal."""
+        """Return at most one request for a release, from a page or the pedal."""
         asked = self.context.evidence.asked()
         for what in asked[self._asked :]:
             self._asked += 1

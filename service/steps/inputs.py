@@ -44,7 +44,10 @@ class EarlierAnswer(Generic[R]):
 
 
 def earlier_answer(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> EarlierAnswer[R]:
-    """The result of an earlier step, as the answer of a kind of job. Raises ConfigurationError if it is not one."""
+    """Return the result of an earlier step, as the answer of a kind of job.
+
+    Raises ConfigurationError if it is not one.
+    """
     result = _result_of(context, step_id)
     try:
         answer = kind.read_answer(result)
@@ -58,7 +61,7 @@ def earlier_answer(context: StepContext, step_id: str, kind: JobKind[Any, R]) ->
 
 
 def _result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
-    """The Result of an earlier step, as plain data; ConfigurationError if it has none."""
+    """Return the Result of an earlier step, as plain data; ConfigurationError if it has none."""
     state = context.run.steps.get(step_id)
     if state is None or not state.result:
         raise ConfigurationError(
@@ -70,7 +73,7 @@ def _result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
 
 
 def earlier_result(context: StepContext, step_id: str, model: type[M]) -> M:
-    """The Result of an earlier step of a known kind. Raises ConfigurationError if it has none, or another."""
+    """Return the Result of an earlier step of a known kind. Raises ConfigurationError if it has none, or another."""
     result = _result_of(context, step_id)
     try:
         return model.model_validate(result)
@@ -83,7 +86,7 @@ def earlier_result(context: StepContext, step_id: str, model: type[M]) -> M:
 
 
 def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
-    """The newest artefact of one kind that an earlier step produced."""
+    """Return the newest artefact of one kind that an earlier step produced."""
     state = context.run.steps.get(step_id)
     found = [ref for ref in (state.artefacts if state else ()) if ref.kind == kind]
     if not found:
@@ -96,9 +99,10 @@ def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
 
 
 def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[PosedPhotograph]:
-    """Every valid photograph of the given capture steps with its pose, in the order of capture.
+    """Return every valid photograph of the given capture steps with its pose, in the order of capture.
 
-    Read from the evidence, because the context's state lacks events since the step began, such as its own images.
+    They are read from the evidence, because the context's state does not have the events since the step began, such
+    as the step's own images.
     """
     images: list[PosedPhotograph] = []
     for step_id in step_ids:
@@ -121,7 +125,7 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Posed
 
 
 def raw_files(context: StepContext, images: Iterable[PosedPhotograph]) -> list[tuple[PosedPhotograph, str]]:
-    """Each photograph with the SHA-256 of its raw file.
+    """Return each photograph with the SHA-256 of its raw file.
 
     Raises:
         ConfigurationError: a photograph has none.
@@ -144,7 +148,7 @@ def raw_files(context: StepContext, images: Iterable[PosedPhotograph]) -> list[t
 
 
 def raw_of(files: Iterable[ArtefactRef]) -> str | None:
-    """SHA-256 of the raw file among the files of an exposure; None without one."""
+    """Return the SHA-256 of the raw file among the files of an exposure; None without one."""
     return next((ref.sha256 for ref in files if ref.kind == "raw"), None)
 
 
@@ -170,7 +174,7 @@ def with_robot_pose(photograph: PosedPhotograph, view: RecordedView) -> PosedPho
 
 
 def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer]:
-    """What the worker found in the hand-held images of a step, by the SHA-256 of the photograph.
+    """Return the worker's findings in the hand-held images of a step, by the SHA-256 of the photograph.
 
     Without a CT, each new image refines the poses of all: the newest ones are used.
     """
@@ -194,21 +198,21 @@ class _CarriedBy(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class CameraMounting:
-    """How the camera was mounted on the arm, and the references that are recorded in its place."""
+    """The camera's mounting on the arm, and the references that are recorded in its place."""
 
     mounting: Mounting
     references: Mapping[str, Reference | Each | None]
 
 
 def mounting_of(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> CameraMounting:
-    """What turns robot poses into camera poses (service/worker/inputs.py).
+    """Return what turns robot poses into camera poses (service/worker/inputs.py), with the references to it.
 
     A correction belongs to one arm: it is given with the stations at which that arm stood.
 
     Args:
-        context: of the step.
+        context: the step's surroundings: devices, evidence, clock.
         step_ids: the hand-eye calibrations; those after the first are of further arms.
-        stations: of the images.
+        stations: the stations at which the images were taken.
     """
     first, *further = step_ids
     at = sorted(set(stations))
@@ -225,7 +229,7 @@ def mounting_of(context: StepContext, step_ids: Sequence[str], stations: Iterabl
 
 
 def arms_without_hand_eye(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> list[str]:
-    """Names of the robots that carried the camera at these stations, and in none of these calibrations."""
+    """Return the names of the robots that carried the camera at these stations, and in none of these calibrations."""
     known = {robot for step_id in step_ids for robot in earlier_result(context, step_id, _CarriedBy).robots}
     return sorted({context.devices.layout(station).robot for station in stations if station} - known)
 
@@ -267,6 +271,6 @@ def _arm_of(context: StepContext, step_id: str, stations: Sequence[str]) -> _Cal
 
 
 def intrinsics_covariance_of(found: EarlierAnswer[calibrate.Answer]) -> ParameterCovariance | None:
-    """Covariance of a calibration's intrinsics, with the parameters' names; None if it was not computed."""
+    """Return the covariance of a calibration's intrinsics, with the parameters' names; None if not computed."""
     record = found.answer.details.intrinsics
     return None if record is None else record.covariance

@@ -36,10 +36,10 @@ def look_at_further(
     """Enqueue the job on every new image of a further camera in this step. Returns at once.
 
     Args:
-        context: of the capture step.
-        spheres_m: centres in the CT.
-        radius_m: of the spheres.
-        references: what is recorded instead of `spheres_m`.
+        context: the capture step's surroundings: devices, evidence, clock.
+        spheres_m: the spheres' centres in the CT.
+        radius_m: the spheres' radius.
+        references: the references that are recorded instead of `spheres_m`.
     """
     jobs = context.evidence.jobs(context.step.id)
     begun = {image_of(job).sha256 for job in jobs if job.kind == further_view.KIND.name}
@@ -59,7 +59,7 @@ def look_at_further(
 
 
 def _exposures(context: StepContext) -> list[tuple[str, FurtherExposure]]:
-    """(viewpoint, exposure) of every usable view of the step."""
+    """Return (viewpoint, exposure) of every usable view of the step."""
     return [
         (capture.viewpoint, exposure)
         for capture in context.evidence.captures(context.step.id)
@@ -69,7 +69,7 @@ def _exposures(context: StepContext) -> list[tuple[str, FurtherExposure]]:
 
 
 def describe_further(job: JobState) -> str:
-    """One line on one image: `v1_005, side: 7/8 spheres, 0.18 px`, or what is wrong with it."""
+    """Return one line on one image: `v1_005, side: 7/8 spheres, 0.18 px`, or what is wrong with it."""
     viewpoint = image_of(job).viewpoint
     if job.status == "failed":
         return f"{viewpoint}, further camera: could not be analysed: {job.message}"
@@ -86,16 +86,16 @@ ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
 
 
 class CoverageRule(Record):
-    """When a view counts for a point of the specimen's surface."""
+    """The rules by which a view counts for a point of the specimen's surface."""
 
     min_views: Annotated[int, Field(ge=1)] = 2  # views that must see the point
     # Angle between the viewing ray and the normal of the surface.
     max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 65.0
-    max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # from the camera
+    max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # the largest distance from the camera
 
 
 class LiveParams(Record):
-    """What the numbers after each image are computed from, and how."""
+    """The steps and limits that the numbers after each image are computed from."""
 
     calibration: Annotated[str, NAMES_CALIBRATION]  # step with the intrinsics
     hand_eye: Annotated[str, NAMES_CALIBRATION]  # step with T_flange_camera
@@ -106,7 +106,7 @@ class LiveParams(Record):
     # hand-eye calibration show it.
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
     arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # likewise, the scatter of the camera's rotations
-    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
+    coverage: CoverageRule = CoverageRule()  # rules by which a view counts for a point of the specimen's surface
     # At the end of the step, for jobs that have not finished: the longest wait without any of them finishing.
     wait_s: Annotated[float, Field(ge=0)] = 60.0
 
@@ -144,7 +144,7 @@ class LiveAnalysis:
         return analysis
 
     def look(self) -> None:
-        """Enqueue the job on every new image, and tell the numbers of earlier ones. Returns at once."""
+        """Enqueue the job on every new image, and show the numbers of earlier ones. Returns at once."""
         begun = {image_of(job).sha256 for job in self._jobs("live_view")}
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
@@ -168,13 +168,13 @@ class LiveAnalysis:
     def summary(
         self, station: str, candidates: Sequence[tuple[Viewpoint, float]], retakes: str = "", again: int = 0
     ) -> dict[str, float]:
-        """Wait for the last images while their jobs go on; the measures. If a gate fails, suggest further views.
+        """Wait for the jobs on the last images; return the measures. If a gate fails, suggest further views.
 
         Args:
-            station: of the robot.
+            station: the robot's station.
             candidates: further viewpoints at this station, with the travel time (s).
-            retakes: advice on images to take again, to which the suggestion is added.
-            again: number of images to take again.
+            retakes: the advice on images to take again, to which the suggestion is added.
+            again: the number of images to take again.
         """
         self._wait()
         error_gate, coverage_gate = self._gate(ERROR), self._gate(COVERAGE)
@@ -208,12 +208,12 @@ class LiveAnalysis:
         return dict(answer.measures)
 
     def spoilt_in_a_row(self) -> list[ImageSharpness]:
-        """The blurred or black images at the end of this step, if there are so many that the capture must stop."""
+        """Return the blurred or black images at this step's end, if there are so many that the capture must stop."""
         mine = self._looked_at(self.context.step.id)
         return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
 
     def spoilt(self) -> dict[str, str]:
-        """Wait for the last images while their jobs go on; the reason of each spoilt image, by its SHA-256.
+        """Wait for the last images while their jobs go on; return the reason of each spoilt image, by its SHA-256.
 
         Raises ImagesSpoiltError after several in a row.
         """
@@ -224,7 +224,7 @@ class LiveAnalysis:
         return why_spoilt(self._looked_at(self.context.step.id), self._looked_at(*self.params.images_of))
 
     def unexamined(self) -> list[str]:
-        """The viewpoints whose image no finished job has looked at: nobody knows whether it is spoilt."""
+        """Return the viewpoints whose image no finished job has looked at: nobody knows whether it is spoilt."""
         captures = [c for c in self.context.evidence.captures(self.context.step.id) if all(c.verdicts.values())]
         seen = {image_of(job).sha256 for job in self._jobs("live_view") if job.status == "finished"}
         return [capture.viewpoint for capture in captures if capture.artefacts[0].sha256 not in seen]
@@ -237,7 +237,7 @@ class LiveAnalysis:
             self.context.note(SPOILT, viewpoints=names, attempt=self.context.attempt)
 
     def suggested(self) -> set[str]:
-        """Names of the viewpoints that earlier attempts of this step suggested."""
+        """Return the names of the viewpoints that earlier attempts of this step suggested."""
         return {view.viewpoint for note in suggested_views(self.context.state) for view in note.viewpoints}
 
     def _suggest(
@@ -261,7 +261,7 @@ class LiveAnalysis:
             f"{short}. {confirm} {len(suggestions)} more views ({names}): the error is then predicted to be "
             f"{last.predicted_error_mm:.3f} mm and the coverage {100 * last.coverage:.0f} %"
         )
-        self.context.tell(advice)  # the advice on retakes was told before
+        self.context.tell(advice)  # the advice on retakes was shown before
         # Pages show the newest note with advice, so it must hold everything that the confirmation does.
         both = f"{retakes}. {advice}" if retakes else advice
         # This note replaces that of the retakes, so it repeats what has to be done for them.
@@ -278,7 +278,7 @@ class LiveAnalysis:
         return [job for step in steps for job in self.context.evidence.jobs(step) if job.kind == kind]
 
     def _earlier(self) -> tuple[tuple[Hash, ...], Each | None]:
-        """The files of the jobs on images that still count, in the order of capture, and the reference to them."""
+        """Return the files of the jobs on images that still count, in the order of capture, and their reference."""
         steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
         state = self.context.evidence.state()
         captures: list[RecordedView] = []
@@ -298,7 +298,7 @@ class LiveAnalysis:
         return files, each if resolve(each.record(), jobs) == list(files) else None
 
     def _looked_at(self, *steps: str) -> list[ImageSharpness]:
-        """The sharpness of the images of these steps whose job has finished, in the order of capture."""
+        """Return the sharpness of the images of these steps whose job has finished, in the order of capture."""
         by_image = {image_of(j).sha256: j for j in self._jobs("live_view") if j.status == "finished"}
         captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
         hashes = [capture.artefacts[0].sha256 for capture in captures]
@@ -340,7 +340,7 @@ class LiveAnalysis:
 
 
 def seen_words(seen: float, expected: float | None) -> str:
-    """`9/10 spheres`, or `13 spheres (10 expected in this image)` if there are more than expected."""
+    """Return `9/10 spheres`, or `13 spheres (10 expected in this image)` if there are more than expected."""
     if expected is None:
         return f"{seen:.0f} spheres"
     if seen > expected:
@@ -349,7 +349,7 @@ def seen_words(seen: float, expected: float | None) -> str:
 
 
 def describe_view(job: JobState) -> str:
-    """One line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
+    """Return one line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
     if job.status == "failed":
         return f"{image_of(job).viewpoint}: could not be analysed: {job.message}"
     m, answer = job.measures, live_view.KIND.read_answer(job.result)
@@ -388,7 +388,7 @@ class SharedArguments:
 
     @classmethod
     def of(cls, context: StepContext, params: LiveParams) -> SharedArguments:
-        """From the results of earlier steps. Raises ConfigurationError if one is missing."""
+        """Read the arguments from the results of earlier steps. Raises ConfigurationError if one is missing."""
         scan = earlier_answer(context, params.spheres_of, locate_spheres.KIND)
         calibration = earlier_answer(context, params.calibration, calibrate.KIND)
         hand_eye = earlier_answer(context, params.hand_eye, calibrate.KIND)
@@ -421,7 +421,7 @@ class SharedArguments:
         )
 
     def arguments(self, mounting: Mounting) -> live_view.LiveArguments:
-        """What the arguments of all jobs share, with the mounting at a station."""
+        """Return what the arguments of all jobs share, with the mounting at a station."""
         return live_view.LiveArguments(
             camera=self.camera,
             **mounting.set_fields(),

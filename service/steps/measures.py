@@ -32,13 +32,13 @@ class MeasureRecord(Record):
 
     @classmethod
     def declared(cls) -> dict[str, Measure]:
-        """The declaration of each measure, by name, in the order of the fields."""
+        """Return the declaration of each measure, by name, in the order of the fields."""
         found = {name: _declaration(field) for name, field in cls.model_fields.items()}
         return {name: measure for name, measure in found.items() if measure is not None}
 
     @classmethod
     def read(cls, values: Mapping[str, float]) -> Self:
-        """The record of numbers that have the names of measures, such as those of a job.
+        """Return the record of numbers that have the names of measures, such as those of a job.
 
         Raises:
             DataError: a name is not declared.
@@ -46,7 +46,7 @@ class MeasureRecord(Record):
         return _validated(cls, dict(values))
 
     def plain(self) -> dict[str, float]:
-        """The numbers that were measured, by name, as events and gates have them."""
+        """Return the numbers that were measured, by name, as events and gates have them."""
         values = {name: getattr(self, name) for name in type(self).declared()}
         return {name: float(value) for name, value in values.items() if value is not None}
 
@@ -60,22 +60,22 @@ class RegistrationMeasures(MeasureRecord, Generic[M]):
     In events and gates, the name of the registration stands before the name of the number: `colmap_rms_px`.
     """
 
-    registrations: Mapping[str, M] = Field(default_factory=dict)  # by name
+    registrations: Mapping[str, M] = Field(default_factory=dict)  # the registrations' measures, by name
 
     @classmethod
     def of_one(cls) -> type[MeasureRecord]:
-        """The record of one registration."""
+        """Return the record of one registration."""
         return get_args(cls.model_fields["registrations"].annotation)[1]
 
     @classmethod
     def declared_for(cls, registrations: Iterable[str]) -> dict[str, Measure]:
-        """All declarations, with those of the registrations of these names."""
+        """Return all declarations, with those of the registrations of these names."""
         one = cls.of_one().declared()
         return cls.declared() | {f"{name}_{number}": one[number] for name in registrations for number in one}
 
     @classmethod
     def read_all(cls, values: Mapping[str, float], registrations: Iterable[str]) -> Self:
-        """The record of numbers as they are recorded. Raises DataError where a name is not declared."""
+        """Return the record of numbers as they are recorded. Raises DataError where a name is not declared."""
         own = {name: value for name, value in values.items() if name in cls.declared()}
         rest = {name: value for name, value in values.items() if name not in own}
         numbers = cls.of_one().declared()
@@ -87,7 +87,7 @@ class RegistrationMeasures(MeasureRecord, Generic[M]):
         return _validated(cls, {**own, **rest, "registrations": each})
 
     def plain(self) -> dict[str, float]:
-        """The numbers that were measured, by name, with those of every registration."""
+        """Return the numbers that were measured, by name, with those of every registration."""
         each = {
             f"{name}_{number}": value
             for name, record in self.registrations.items()
@@ -135,7 +135,7 @@ Deg = Annotated[float | None, Measure("°", 0, 360)]
 
 
 class LayoutMeasures(MeasureRecord):
-    """Of the layout of the spheres: whether one set of spheres could be mistaken for another."""
+    """The measures of the layout of the spheres: whether one set of spheres could be mistaken for another."""
 
     layout_margin_mm: Annotated[
         FineMm, "misfit of the best wrong assignment of four spheres: how far they are from being mistaken"
@@ -150,7 +150,7 @@ class LayoutMeasures(MeasureRecord):
 
 
 class SphereMeasures(LayoutMeasures):
-    """Of the spheres in a mesh, and how they moved since an earlier one."""
+    """The measures of the spheres in a mesh, and of how they moved since an earlier one."""
 
     spheres_found: Annotated[Count, "spheres found in the mesh"] = None
     radius_residual_max_mm: Annotated[
@@ -192,7 +192,7 @@ class SphereMeasures(LayoutMeasures):
 
 
 class CaptureMeasures(MeasureRecord):
-    """Of a capture by the robot."""
+    """The measures of a capture by the robot."""
 
     viewpoints_planned: Annotated[Count, "viewpoints that the step was to take"] = None
     viewpoints_captured: Annotated[Count, "viewpoints with a valid image"] = None
@@ -203,7 +203,7 @@ class CaptureMeasures(MeasureRecord):
 
 
 class PredictedMeasures(MeasureRecord):
-    """What a capture predicts of the registration, before it is computed."""
+    """The registration's accuracy and coverage, predicted by a capture before it is computed."""
 
     predicted_target_error_mm: Annotated[
         ErrorMm, "predicted error of the registration at the worst point of the specimen"

@@ -30,7 +30,7 @@ class MotionLimits:
 
 
 def settle_criteria(context: StepContext) -> SettleCriteria:
-    """The protocol's definition of standing still."""
+    """Return the protocol's definition of standing still."""
     settle = context.protocol.settle
     return SettleCriteria(
         window_s=settle.window_s,
@@ -50,7 +50,7 @@ def move_and_settle(
     *,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> SettleReport:
-    """Move to joints (N,) and return when the pose stream is quiet. `meanwhile` is called after the motion has begun.
+    """Move to joints (N,) and return when the pose stream is quiet. `meanwhile` is called after the motion started.
 
     Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still; it
     did not set out if the confirmation was too long ago).

@@ -27,16 +27,16 @@ class BoardPose(_NoteRecord):
 
 
 class BoardPrediction(_NoteRecord):
-    """What the planned board images are predicted to give; None where there are too few images for a prediction.
+    """The result that is predicted of the planned board images; None where there are too few images to predict it.
 
     Attributes:
-        coverage: share of the image's cells in which a corner is expected.
-        coverage_map: expected corners in each cell, row by row.
-        uncertainty_mm: of a projected point at the specimen's distance, 1σ.
-        tilt_deg: largest tilt of the board.
-        rotation_spread_deg: spread of the camera's rotations.
-        hand_eye_sigma_mm: of the hand-eye translation, 1σ.
-        hand_eye_sigma_deg: of the hand-eye rotation, 1σ.
+        coverage: the share of the image's cells in which a corner is expected.
+        coverage_map: the expected corners in each cell, row by row.
+        uncertainty_mm: the standard deviation of a projected point at the specimen's distance.
+        tilt_deg: the largest tilt of the board.
+        rotation_spread_deg: the spread of the camera's rotations.
+        hand_eye_sigma_mm: the standard deviation of the hand-eye translation.
+        hand_eye_sigma_deg: the standard deviation of the hand-eye rotation.
     """
 
     coverage: float
@@ -52,12 +52,12 @@ class BoardPlan(_NoteRecord):
     """Planned board images.
 
     Attributes:
-        why: the poses were planned: first, start, rest, replacement or mend.
-        attempt: of the step.
-        poses: in the order of capture.
-        prediction: of what they will give.
-        from_images: number of images from which camera, mount and board were known.
-        instead_of: reasons why earlier images are replaced, by viewpoint.
+        why: the occasion of the plan: first, start, rest, replacement or mend.
+        attempt: the step's attempt.
+        poses: the poses in the order of capture.
+        prediction: the prediction of what they will give.
+        from_images: the number of images from which camera, mount and board were known.
+        instead_of: the reasons why earlier images are replaced, by viewpoint.
     """
 
     why: str = ""
@@ -69,7 +69,7 @@ class BoardPlan(_NoteRecord):
 
 
 class SuggestedViews(_NoteRecord):
-    """What a capture found wanting, and the views that would help most."""
+    """The advice on what a capture did not achieve, and the views that would help most."""
 
     advice: str
     viewpoints: tuple[Suggestion, ...]
@@ -87,11 +87,11 @@ class ImagesToRepeat(_NoteRecord):
 
 
 class Deidentified(_NoteRecord):
-    """Attributes that were removed from files before these were kept.
+    """Attributes that were removed from files before these were stored.
 
     Attributes:
-        device: from which the files came.
-        files: their number.
+        device: the device from which the files came.
+        files: the number of files.
         removed: the names of the attributes, over all files; never their values.
     """
 
@@ -111,20 +111,20 @@ class Deidentified(_NoteRecord):
 
 
 def deidentified(state: StepState) -> tuple[Deidentified, ...]:
-    """What was removed from files in a step, oldest first."""
+    """Return what was removed from files in a step, oldest first."""
     return tuple(Deidentified.model_validate(note.data) for note in state.notes if note.note == DEIDENTIFIED)
 
 
 def board_plans(state: StepState) -> tuple[BoardPlan, ...]:
-    """The board images planned in a step, oldest plan first."""
+    """Return the board images planned in a step, oldest plan first."""
     return tuple(BoardPlan.model_validate(note.data) for note in state.notes if note.note == BOARD_POSES)
 
 
 def suggested_views(state: StepState) -> tuple[SuggestedViews, ...]:
-    """The suggestions of a step, oldest first."""
+    """Return the suggestions of a step, oldest first."""
     return tuple(SuggestedViews.model_validate(note.data) for note in state.notes if note.note == SUGGESTION)
 
 
 def images_to_repeat(state: StepState, note: str) -> tuple[ImagesToRepeat, ...]:
-    """The notes SPOILT or DEPARTING of a step, oldest first."""
+    """Return the notes SPOILT or DEPARTING of a step, oldest first."""
     return tuple(ImagesToRepeat.model_validate(found.data) for found in state.notes if found.note == note)

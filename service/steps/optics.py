@@ -25,16 +25,16 @@ def optics_departures(
     quiet: bool = False,
     against_itself: bool = False,
 ) -> tuple[OpticsDeparture, ...] | None:
-    """How images of this step differ from those from which the intrinsics were calibrated, by viewpoint.
+    """Return how images of this step differ from those of the intrinsic calibration, by viewpoint.
 
     The reference is the last calibration up to this step that has images; None without one. Departures are noted and
-    told to the operator.
+    shown to the operator.
 
     Args:
-        context: of the step.
-        captures: images of this step to compare; None: all.
-        quiet: neither note departures nor tell the operator.
-        against_itself: compare the images with one another, because a later step calibrates from them.
+        context: the step's surroundings: devices, evidence, clock.
+        captures: the images of this step to compare; None: all.
+        quiet: true to neither note departures nor show them to the operator.
+        against_itself: true to compare the images with one another, because a later step calibrates from them.
     """
     mine = context.evidence.captures(context.step.id) if captures is None else captures
     reference = mine if against_itself else _calibration_images(context)
@@ -53,12 +53,12 @@ def optics_departures(
 
 
 def departing_images(departures: Sequence[OpticsDeparture]) -> int:
-    """The number of images that differ."""
+    """Return the number of images that differ."""
     return len({departure.image for departure in departures})
 
 
 class _CalibrationParams(BaseModel):
-    """What a calibration step solves, and the step whose images it uses if not its own."""
+    """The calibrations that a step solves, and the step whose images it uses if not its own."""
 
     solve: tuple[str, ...]
     images_of: str | None = None
@@ -84,6 +84,6 @@ def _optics(capture: RecordedView) -> Optics:
 
 
 def _stated(name: str, record: Mapping[str, Any]) -> bool:
-    """Whether the image states a value: 0 is a valid position of the focus motor, but means "unknown" elsewhere."""
+    """Return whether the image has a value: 0 is a position of the focus motor, but means "unknown" elsewhere."""
     value = record.get(name)
     return value is not None if name == "focus_position" else bool(value)

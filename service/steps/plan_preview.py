@@ -34,7 +34,7 @@ from service.steps.viewpoints import plan_viewpoints
 
 @dataclass(frozen=True, slots=True)
 class BoardPreview:
-    """The board images of a calibration as they will be planned if board, mount and lens are as stated."""
+    """The board images of a calibration as they will be planned if board, mount and lens are as described."""
 
     T_base_camera: Array  # (K, 4, 4)
     prediction: BoardPrediction
@@ -44,9 +44,9 @@ class BoardPreview:
 def preview_board_poses(
     protocol: Protocol, step: Step, rig: Rig, layout: Callable[[str], StationLayout]
 ) -> BoardPreview | None:
-    """None for steps whose board poses the software does not plan.
+    """Preview the board poses of a step; None if the software does not plan them.
 
-    Raises ConfigurationError if protocol or rig file lack what a plan needs, or the scene is out of reach.
+    Raises ConfigurationError if protocol or rig file do not have what a plan needs, or the scene is out of reach.
     """
     if not isinstance(step.params, calibration.Params) or step.params.board_poses is None or protocol.board is None:
         return None
@@ -67,7 +67,7 @@ def preview_board_poses(
 def preview_plans(
     protocol: Protocol, step: Step, rig: Rig, layout: Callable[[str], StationLayout]
 ) -> tuple[StepPlan, ...]:
-    """One plan for each station, from the arm's usual posture above the scene.
+    """Return one plan for each station, from the arm's usual posture above the scene.
 
     Empty for steps of other kinds, and if the rig file names no arm of known kinematics. Stations without an arm are
     left out.
@@ -91,7 +91,7 @@ def preview_plans(
 
 
 def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | None:
-    """The arm that the rig file names; None if it names none, or one of unknown kinematics, or no arm is there."""
+    """Return the arm that the rig file names; None if it names none or is not there, or for unknown kinematics."""
     collision = rig.section.collision
     model = known_arm(collision.arm) if collision.arm is not None and layout.is_arm else None
     if model is None:
@@ -108,7 +108,7 @@ def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | 
 
 
 def _feasible(arm: ArmAtStation | None, sharp_at_m: Array) -> Callable[[Transform], bool]:
-    """Whether the arm can reach T_base_camera; always, for an unknown arm."""
+    """Return a test if the arm can reach T_base_camera; it is always true for an unknown arm."""
     if arm is None:
         return lambda _T: True
     scene = arm.scene(usual_posture(arm.model, arm.layout, arm.T_flange_camera), sharp_at_m=sharp_at_m)

@@ -53,12 +53,12 @@ class ArmAtStation:
     """An arm of known kinematics at a station, with everything that a motion plan there depends on.
 
     Attributes:
-        layout: of the station.
-        model: kinematics of the arm.
+        layout: the station's layout.
+        model: the arm's kinematics.
         T_flange_camera: (4, 4) the best known mounting of the camera.
         collision: obstacles, and the size of the camera.
-        optics: of the lens, if the rig file describes it.
-        motion: speed, acceleration and pauses of the protocol.
+        optics: the lens, if the rig file describes it.
+        motion: the protocol's speed, acceleration and pauses.
     """
 
     layout: StationLayout
@@ -69,7 +69,7 @@ class ArmAtStation:
     motion: Motion
 
     def scene(self, start_rad: Array, *, sharp_at_m: Array | None = None) -> PlanningScene:
-        """The planner's problem for a motion that starts with the joints (N,) at `start_rad`.
+        """Return the planner's problem for a motion that starts with the joints (N,) at `start_rad`.
 
         `sharp_at_m`: (N, 3) points that must be sharp, base frame; None: the specimen.
         """
@@ -105,7 +105,7 @@ class ArmAtStation:
         )
 
     def _specimen(self) -> tuple[Transform, Array]:
-        """T_base_specimen, origin in the middle of its bounding box, and the box's half sizes (3,)."""
+        """Return T_base_specimen, origin in the middle of its bounding box, and the box's half sizes (3,)."""
         approach, up = np.array(self.layout.approach), np.array([0.0, 0.0, 1.0])
         axes = np.column_stack([approach, np.cross(up, approach), up])
         half = 0.5 * np.array(self.collision.specimen_size_m)
@@ -115,7 +115,7 @@ class ArmAtStation:
 
 
 def arm_at_station(context: StepContext, station: str, T_flange_camera: Transform) -> ArmAtStation | None:
-    """The arm at a station; None if its kinematics are not known, or if it is no arm."""
+    """Return the arm at a station; None if its kinematics are not known, or if it is no arm."""
     layout = context.devices.layout(station)
     if not layout.is_arm:
         return None
@@ -150,14 +150,14 @@ def plan_step(
     Progress is shown meanwhile, and pause and abort are heeded.
 
     Args:
-        context: of the step.
-        viewpoints: to visit.
+        context: the step's surroundings: devices, evidence, clock.
+        viewpoints: the viewpoints to visit.
         T_flange_camera: (4, 4) the best known mounting of the camera.
-        order: as listed, or the shortest way.
+        order: the order of the viewpoints: as listed, or the shortest way.
         sharp_at_m: (N, 3) points that must be sharp, base frame; None: the specimen.
 
     Raises:
-        StepInterruptedError: paused or aborted meanwhile.
+        StepInterruptedError: the step was paused or aborted meanwhile.
     """
     plans: list[StepPlan] = []
     for station in dict.fromkeys(v.station for v in viewpoints):
@@ -183,7 +183,7 @@ def plan_step(
 
 
 def _attending(context: StepContext) -> Progress:
-    """Shows how far the planning is and looks at the buttons, at most every `_LOOK_S`."""
+    """Show how far the planning is and look at the buttons, at most every `_LOOK_S`."""
     due_s = context.monotonic_s()
 
     def progress(what: str, done: int, total: int) -> None:
@@ -223,7 +223,7 @@ def plan_station(
 
 
 def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
-    """The plans of all stations as one, which is told and recorded."""
+    """Join the plans of all stations into one, record it and report it to the operator."""
     whole = StepPlan(
         tuple(v for plan in plans for v in plan.viewpoints),
         {name: reason for plan in plans for name, reason in plan.refused.items()},
@@ -242,7 +242,7 @@ def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
 def feasible_extra(
     context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform
 ) -> list[tuple[Viewpoint, float]]:
-    """The further viewpoints of one station that the arm can reach, with the travel time (s) from where it stands.
+    """Return the further viewpoints of one station that the arm can reach, with the travel time (s) from its place.
 
     All of them, with a time of 0, for an arm of unknown kinematics.
     """
@@ -263,7 +263,7 @@ def feasible_extra(
 
 
 def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Transform) -> Array:
-    """Joints (N,) with the elbow up and the camera above the scene, from which a plan without a robot starts.
+    """Return joints (N,) with the elbow up and the camera above the scene, where a plan without a robot starts.
 
     Raises:
         ConfigurationError: the arm does not reach the scene of this station.

@@ -35,7 +35,7 @@ _ALIAS = {"deg": "°", "1": "", "degrees": "°"}
 
 
 def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, Measure] | None:
-    """The measures that a step with its parameters can yield; None if that cannot be determined."""
+    """Return the measures that a step with its parameters can yield; None if that cannot be determined."""
     kind = step_kinds().get(step.kind)
     if kind is None:
         return None
@@ -52,12 +52,12 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
 def implausible(
     loaded: LoadedProtocol, rig: RigSection | None = None, devices: Mapping[str, RigDevice] = NO_DEVICES
 ) -> tuple[YamlProblem, ...]:
-    """Unknown measures, wrong units, limits that are not credible, motions too fast, unknown stations; by line.
+    """Find unknown measures, wrong units, incredible limits, too fast motions and unknown stations; sort by line.
 
     Args:
         loaded: the protocol.
         rig: the rig in which it is to run, if that is known.
-        devices: what the drivers say of the rig's devices, by name.
+        devices: the drivers' statements about the rig's devices, by name.
     """
     tree = parse_yaml(loaded.source, name="the protocol")
     found: list[tuple[FieldPath, str]] = []
@@ -106,7 +106,7 @@ def require_plausible(
 
 
 def require_devices(protocol: Protocol, rig: Rig, devices: Mapping[str, RigDevice]) -> None:
-    """Refuse a rig that lacks a device of a step which nobody may skip.
+    """Refuse a rig without a device of a step which nobody may skip.
 
     Raises:
         ConfigurationError: the message names the first such step.
@@ -147,7 +147,7 @@ def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tupl
 
 
 def _named(step: Step, earlier: Sequence[Step], steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:
-    """Names in the params of a step that are not those of earlier steps, or of steps that do something else."""
+    """Yield names in the params of a step that are not those of earlier steps, or of steps that do something else."""
     before = [one.id for one in earlier]
     for at, name, mark in named_steps(step.params):
         where = ("params", *at)
@@ -162,7 +162,7 @@ def _named(step: Step, earlier: Sequence[Step], steps: Mapping[str, Step]) -> It
 
 
 def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:
-    """Poses of an arm that a registration asks for although no step says how the arm held the camera."""
+    """Yield poses of an arm that a registration asks for although no step says how the arm held the camera."""
     if step.gives != "registrations":
         return
     wanted = WantedRegistrations.of(step.params)
@@ -179,7 +179,7 @@ def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, s
 def _too_fast(
     protocol: Protocol, rig: RigSection | None, devices: Mapping[str, RigDevice]
 ) -> Iterator[tuple[FieldPath, str]]:
-    """The protocol's motion, if it moves an arm faster than that may move, or than it can stop in time."""
+    """Yield the protocol's motion, if it moves an arm faster than that may move, or than it can stop in time."""
     if not any(step.moves_robot for step in protocol.steps):
         return
     named = None if rig is None else rig.collision.arm
@@ -191,7 +191,7 @@ def _too_fast(
 
 
 def _too_late(protocol: Protocol) -> Iterator[tuple[FieldPath, str]]:
-    """Waits before a step that moves the robot tries again, after which the confirmation would not hold any more."""
+    """Yield waits before a step that moves the robot tries again, after which the confirmation would have lapsed."""
     holds_s = protocol.motion.confirmed_for_s
     for index, step in enumerate(protocol.steps):
         if step.moves_robot and step.recovery.retries and step.recovery.wait_s >= holds_s:
@@ -203,7 +203,7 @@ def _too_late(protocol: Protocol) -> Iterator[tuple[FieldPath, str]]:
 
 
 def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:
-    """Stations that the protocol names but the rig file does not have."""
+    """Yield stations that the protocol names but the rig file does not have."""
 
     def walk(value: Plain, at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
         if isinstance(value, dict):

@@ -34,7 +34,7 @@ _MAPPERS = {"colmap": "incremental", "glomap": "global", "triangulated": "triang
 class Task:
     """A job that a registration needs; `job` is None until it is enqueued."""
 
-    name: str  # of the job's key
+    name: str  # the name in the job's key
     request: JobRequest
     job: JobState | None
 
@@ -57,12 +57,12 @@ class RegistrationJobs:
 def registration_jobs(
     state: RunState, step: Step, waited: Iterable[str], outlines: JobRequest, root: str
 ) -> RegistrationJobs:
-    """Every job of every registration of a step, as far as the results so far allow to plan them.
+    """Return every job of every registration of a step, as far as the results so far allow to plan them.
 
     Args:
-        state: of the run.
+        state: the run's state.
         step: the registration step.
-        waited: names of the registrations that the step waits for.
+        waited: the names of the registrations that the step waits for.
         outlines: the job that detects the spheres; the arguments of all other jobs derive from its arguments.
         root: the name of that job; jobs that use other images have another root in their names.
     """
@@ -93,7 +93,7 @@ class _Model:
     tracks: str | None = None
 
     def fields(self) -> dict[str, str]:
-        """The files as arguments of the jobs that use them."""
+        """Return the files as arguments of the jobs that use them."""
         return {"model": self.model} if self.tracks is None else {"model": self.model, "tracks": self.tracks}
 
 
@@ -117,7 +117,7 @@ class _Plan:
         self.jobs = jobs_of(self.state)
 
     def registration(self, name: str, source: str, size: str, priority: int) -> JobState | None:
-        """The finished job `register` of a registration, or None; the jobs that it needs become tasks."""
+        """Return the finished job `register` of a registration, or None; the jobs that it needs become tasks."""
         self._for, self._priority = name, priority
         if size and (reason := self._no_reduction(size)):
             self.failed[name] = reason
@@ -125,7 +125,7 @@ class _Plan:
         return self._registered(source, size)
 
     def _no_reduction(self, size: str) -> str:
-        """Why a size does not reduce the photographs, or "": a protocol serves cameras of any resolution."""
+        """Return why a size does not reduce the photographs, or "": a protocol serves cameras of any resolution."""
         width, height = _pixels(size)
         camera = read_part(ImagesCamera, self.outlines.arguments, self.jobs).camera
         # Otherwise one side at least would be cropped at full scale.
@@ -156,12 +156,12 @@ class _Plan:
         return None if model is None else self._need("register", source, size, {**markers, **model.fields()})
 
     def _mapper(self, source: str) -> str:
-        """The mapper of a source; a source without its own uses a mapper that another wanted source needs anyway."""
+        """Return the mapper of a source; one without uses that of another wanted source."""
         wanted = [mapper for other, mapper in _MAPPERS.items() if other in self.wanted.poses]
         return _MAPPERS.get(source) or next(iter(wanted), "incremental")
 
     def _model(self, mapper: str, size: str, shared: Mapping[str, Any]) -> _Model | None:
-        """Poses and tracks of structure from motion; None until they are computed."""
+        """Return poses and tracks of structure from motion; None until they are computed."""
         known = next((source for source in reversed(QUICK) if source in self.wanted.poses), None)
         prior = None
         if known is not None:
@@ -187,7 +187,7 @@ class _Plan:
         return _Model(refs[f"{mapper}.json"], refs[f"{mapper}_tracks.npz"])
 
     def _pieces(self, size: str, shared: Mapping[str, Any], prior: Reference | None) -> dict[str, Any] | None:
-        """Features and matches as arguments, with those computed while the images arrived; None until all exist."""
+        """Return features and matches as arguments, and those computed while images arrived; None until all exist."""
         effort = self.wanted.structure_from_motion
         common = {**_copied(shared, "camera"), "effort": effort.plain(), **_copied(shared, *_REDUCED)}
         images = read_part(_Images, shared).images
@@ -225,7 +225,7 @@ class _Plan:
         return {"features": features, "matches": [job.artefacts[0].sha256 for job in finished]}
 
     def _arguments(self, size: str) -> dict[str, Any]:
-        """Arguments of the search for outlines at a size; the other jobs share most of them."""
+        """Return the arguments of the search for outlines at a size; the other jobs share most of them."""
         arguments = dict(self.outlines.arguments)
         arguments.pop("model", None)  # present where the search itself needed poses from structure from motion
         if not size:
@@ -236,7 +236,7 @@ class _Plan:
         return arguments | {"reduced_to": [width, height]}
 
     def _need(self, kind: str, what: str, size: str, arguments: Mapping[str, Any]) -> JobState | None:
-        """The finished job for this work; None until it has finished, or if it has failed."""
+        """Return the finished job for this work; None until it has finished, or if it has failed."""
         name = "-".join(part for part in (what, size, self.root) if part)
         job = newest_job(self.state, self.step, kind, name)
         if job is not None and job.status == "failed":
@@ -253,7 +253,7 @@ class _Plan:
 
 
 def _uncorrected(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments that take the arms' poses as they are reported."""
+    """Return the arguments that take the arms' poses as they are reported."""
     without: dict[str, Any] = {"arm_correction": None}
     if arguments.get("further_arms"):
         without["further_arms"] = [{**arm, **without} for arm in arguments["further_arms"]]
@@ -266,13 +266,13 @@ def _copied(arguments: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _pixels(size: str) -> tuple[int, int]:
-    """Width and height of 1920x1080."""
+    """Return width and height of 1920x1080."""
     width, _, height = size.partition("x")
     return int(width), int(height)
 
 
 def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) -> RegistrationJobs | None:
-    """The jobs of a step's registrations according to the record; None for a step that has not begun them.
+    """Return the jobs of a step's registrations according to the record; None for a step that has not started them.
 
     Also None in runs of old versions, in which a registration waited for all of its sources.
     """
@@ -290,5 +290,5 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
 
 
 def name_of(job: JobState) -> str:
-    """The part of a job's key that tells it from other jobs of its kind."""
+    """Return the part of a job's key that distinguishes it from other jobs of its kind."""
     return job.idempotency_key.split("/")[3]

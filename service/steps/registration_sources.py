@@ -29,14 +29,14 @@ class WantedRegistrations(BaseModel):
     """The registrations that the parameters of a registration step ask for, and the images that they use.
 
     Attributes:
-        images_of: capture steps.
+        images_of: the capture steps' ids.
         control_images_of: capture steps that see the control spheres.
         calibration: the step with the intrinsics.
-        poses: sources.
+        poses: the sources of the poses.
         hand_eye: steps with the mount of the camera on its arm.
-        reduced: sizes of reduced images, such as 1920x1080.
-        reduced_poses: sources for the reduced images.
-        structure_from_motion: how many features and pairs.
+        reduced: the sizes of reduced images, such as 1920x1080.
+        reduced_poses: the sources of the poses for the reduced images.
+        structure_from_motion: the limits on image size, features and pairs.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -52,7 +52,7 @@ class WantedRegistrations(BaseModel):
 
     @classmethod
     def of(cls, params: BaseModel) -> WantedRegistrations:
-        """Those of a registration step with these params."""
+        """Return those of a registration step with these params."""
         return cls.model_validate(params.model_dump(mode="json"))
 
     @property
@@ -68,7 +68,7 @@ class WantedRegistrations(BaseModel):
 
 
 def decisive(protocol: Protocol, step: Step) -> tuple[str, ...]:
-    """The registrations that a registration step waits for: those that gates name, and those that take seconds."""
+    """Return the registrations that a step waits for: those that gates name, and those that take seconds."""
     names = WantedRegistrations.of(step.params).registrations
     measures = [gate.measure for s in (step, *evaluations_of(protocol, step)) for gate in s.gates]
     waited = {name for measure in measures for name in _named(measure, names)} | {n for n in names if n in QUICK}
@@ -78,7 +78,7 @@ def decisive(protocol: Protocol, step: Step) -> tuple[str, ...]:
 
 
 def most_preferred(registrations: Iterable[str]) -> str:
-    """Of several registrations the one to build on; with corrected poses of the arm if there is one."""
+    """Return the one of several registrations to build on; with corrected poses of the arm if there is one."""
     names = tuple(registrations)
     return next((name for name in _BY_PREFERENCE if name in names), names[0])
 
@@ -90,34 +90,34 @@ class _EvaluationParams(BaseModel):
 
 
 def evaluated_step(evaluation: Step) -> str:
-    """The registration step that an evaluation step evaluates."""
+    """Return the registration step that an evaluation step evaluates."""
     return _EvaluationParams.model_validate(evaluation.params.model_dump()).registration
 
 
 def evaluations_of(protocol: Protocol, registration: Step) -> tuple[Step, ...]:
-    """The evaluation steps of a registration step."""
+    """Return the evaluation steps of a registration step."""
     every = (step for step in protocol.steps if step.gives == "accuracy")
     return tuple(step for step in every if evaluated_step(step) == registration.id)
 
 
 def _named(measure: str, names: Iterable[str]) -> list[str]:
-    """The longest name that a measure begins with: `robot_corrected_rms_px` does not belong to `robot`."""
+    """Return the longest name that a measure begins with: `robot_corrected_rms_px` does not belong to `robot`."""
     found = sorted((name for name in names if measure.startswith(f"{name}_")), key=len)
     return found[-1:]
 
 
 def posed(images: Iterable[PosedPhotograph]) -> bool:
-    """Whether the poses of any of the images are known, from a robot or from the spheres."""
+    """Return whether the pose of any of the images is known, from a robot or from the spheres."""
     return any(image.T_base_flange is not None or image.T_scene_camera is not None for image in images)
 
 
 def of_arms(images: Iterable[PosedPhotograph]) -> bool:
-    """Whether an arm carried the camera in any of the images, and no sphere says where that was."""
+    """Return whether an arm carried the camera in any of the images, and no sphere says where that was."""
     return any(image.T_base_flange is not None and image.T_scene_camera is None for image in images)
 
 
 def needing_mount(poses: Iterable[str]) -> tuple[str, ...]:
-    """Those of the sources that need the camera's mount on its arm; "triangulated" may start from the spheres."""
+    """Return the sources that need the camera's mount on its arm; "triangulated" may start from the spheres."""
     names = tuple(poses)
     needing = ARM if "spheres" in names else (*ARM, "triangulated")
     return tuple(name for name in names if name in needing)

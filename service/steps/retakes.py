@@ -15,8 +15,8 @@ from service.steps.notes import DEPARTING, SPOILT, images_to_repeat
 
 CLEAN: list[dict[str, str]] = [{"action": "clean_lens"}]  # for the simulated technician
 IN_A_ROW = 3  # consecutive spoilt images: beyond chance, so they have a common cause
-_MOST_STOPS = 2  # of one step; after that, only the gates judge the images
-_FACTOR = 1.6  # of the edge width in the sharpest image of the step
+_MOST_STOPS = 2  # the most stops of one step; after that, only the gates judge the images
+_FACTOR = 1.6  # the factor of the edge width in the sharpest image of the step
 _WIDEST_PX, _WIDEST_SHARE = 7.0, 0.002  # the largest limit on an edge width, in px and as a share of the image width
 _MOST_NAMES = 6
 
@@ -26,11 +26,11 @@ class ImageSharpness:
     """The sharpness of one image, as a job measured it.
 
     Attributes:
-        viewpoint: its name.
-        sha256: of the photograph.
-        edge_px: width of its clearest edges; None if it has none.
-        black: whether it is black.
-        width: of the image, px.
+        viewpoint: the viewpoint's name.
+        sha256: the photograph's SHA-256.
+        edge_px: the width of its clearest edges; None if it has none.
+        black: true if it is black.
+        width: the image's width, px.
     """
 
     viewpoint: str
@@ -41,13 +41,13 @@ class ImageSharpness:
 
     @classmethod
     def of(cls, job: JobState, *, black: bool, width: int) -> ImageSharpness:
-        """From a finished job on one image, with what its answer says of the image."""
+        """Read the sharpness from a finished job on one image; its answer gives `black` and `width`."""
         image = image_of(job)
         return cls(image.viewpoint, image.sha256, job.measures.get("image_edge_px"), black, width)
 
 
 def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness] = ()) -> dict[str, str]:
-    """The reason of each spoilt image by its SHA-256.
+    """Return the reason of each spoilt image by its SHA-256.
 
     Args:
         images: all images of one step.
@@ -66,7 +66,7 @@ def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness
 
 
 def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) -> list[ImageSharpness]:
-    """The spoilt images at the end of a sequence, in the order of capture; empty if there are fewer than IN_A_ROW."""
+    """Return the spoilt images at the end of a sequence, in the order of capture; none if fewer than IN_A_ROW."""
     row: list[ImageSharpness] = []
     for image in reversed(images):
         if image.sha256 not in reasons:
@@ -76,7 +76,7 @@ def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) 
 
 
 def spoilt_before(context: StepContext) -> set[str]:
-    """SHA-256 of images that were spoilt in an earlier attempt and have not been taken again yet."""
+    """Return the SHA-256 of images that were spoilt in an earlier attempt and have not been taken again yet."""
     captures = context.evidence.captures(context.step.id)
     return {
         capture.artefacts[0].sha256
@@ -90,11 +90,11 @@ def spoilt_before(context: StepContext) -> set[str]:
 def row_to_stop_for(
     context: StepContext, images: Sequence[ImageSharpness], others: Sequence[ImageSharpness]
 ) -> list[ImageSharpness]:
-    """The spoilt images in a row with which a step's images end, where they are to stop it; else none.
+    """Return the spoilt images in a row with which a step's images end, if they are to stop it; else none.
 
     Args:
-        images: of the step, in the order of capture.
-        others: of earlier steps, to compare with.
+        images: the step's images, in the order of capture.
+        others: the images of earlier steps, to compare with.
     """
     if not may_stop(context):
         return []
@@ -103,7 +103,7 @@ def row_to_stop_for(
 
 
 def may_stop(context: StepContext) -> bool:
-    """Whether spoilt images may still stop the step: not again and again, for then a person has seen them."""
+    """Return whether spoilt images may still stop the step: not again and again, for then a person has seen them."""
     return sum(note.advice is not None for note in images_to_repeat(context.state, SPOILT)) < _MOST_STOPS
 
 
@@ -135,7 +135,7 @@ TAKEN_AGAIN: Mapping[str, str] = {
 
 
 def to_take_again(context: StepContext) -> set[str]:
-    """SHA-256 of images that departed from the calibration's optics, or were spoilt, in an earlier attempt."""
+    """Return the SHA-256 of images that an earlier attempt spoilt, or took with other optics than the calibration."""
     captures = context.evidence.captures(context.step.id)
     notes = images_to_repeat(context.state, DEPARTING)
     attempts = [(note.attempt, set(note.viewpoints)) for note in notes if note.attempt is not None]
@@ -147,7 +147,7 @@ def to_take_again(context: StepContext) -> set[str]:
 
 
 def taken_for_good(captures: Iterable[RecordedView], again: Collection[str]) -> set[str]:
-    """The viewpoints that need no image any more: their newest is as required, and not one of `again` (SHA-256).
+    """Return the viewpoints that need no image any more: the newest is as required and not one of `again` (SHA-256).
 
     All others are reached by a motion, so they belong to the plan.
     """
@@ -163,12 +163,12 @@ def advise_retakes(context: StepContext, measures: Mapping[str, float], images: 
     """If a gate on how images were taken fails, note which images a retry takes again.
 
     Args:
-        context: of the step.
-        measures: of the capture.
-        images: how many will be taken again.
+        context: the step's surroundings: devices, evidence, clock.
+        measures: the capture's measures.
+        images: the number of images that will be taken again.
 
     Returns:
-        the advice; "" if none is needed.
+        The advice; "" if none is needed.
     """
     verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
     failed = [verdict for verdict in verdicts if not verdict.passed and verdict.measure in TAKEN_AGAIN]

@@ -24,7 +24,7 @@ class Arc(Record):
     Azimuth 0 looks from the robot's side; tilt 0 looks straight down.
     """
 
-    tilt_deg: float  # from the vertical, 0 to 80
+    tilt_deg: float  # the angle from the vertical, 0 to 80
     azimuth_from_deg: float  # start of the range, from the robot's side
     azimuth_to_deg: float  # end of the range
     count: int  # viewpoints on the arc
@@ -41,14 +41,14 @@ class ViewpointSet(Record):
     """Arcs at one station, and how the camera is rolled and aimed."""
 
     station: str  # name in the rig file
-    prefix: str  # of the viewpoints' names
-    arcs: tuple[Arc, ...]  # where the viewpoints lie
+    prefix: str  # the beginning of the viewpoints' names
+    arcs: tuple[Arc, ...]  # the arcs on which the viewpoints lie
     rolls_deg: tuple[float, ...] = (0.0,)  # rolls of the camera, cycled over the viewpoints
     # Where the top of the image points: away from the base, natural for an arm's wrist, or upwards, as it does for a
     # camera beside a turntable.
     image_top: Literal["away", "up"] = "away"
     aim_spread_m: float = 0.0  # spread of the aim point around the scene centre (for board images)
-    aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the aim point, in the base frame
+    aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the aim point's offset, in the base frame
 
     @property
     def count(self) -> int:
@@ -83,7 +83,7 @@ _APART_M = 0.03  # views nearer than this to a planned one add little
 
 
 def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
-    """All viewpoints of a set in the base frame of its station, in the order of capture.
+    """Return all viewpoints of a set in the base frame of its station, in the order of capture.
 
     Raises NoViewpointError if the set is empty.
     """
@@ -113,7 +113,7 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
 
 
 def denser_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
-    """Further viewpoints that a step may suggest: a grid of tilts and azimuths at the same distance.
+    """Return further viewpoints that a step may suggest: a grid of tilts and azimuths at the same distance.
 
     A viewpoint is named after its place, such as `v2_t25-40` for a tilt of 25° and an azimuth of −40°, so that names
     mean the same in every attempt.
@@ -134,12 +134,12 @@ def denser_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tup
 
 
 def flange_target(T_base_camera: Transform, T_flange_camera: Transform) -> Transform:
-    """T_base_flange that puts the camera at T_base_camera."""
+    """Return T_base_flange that puts the camera at T_base_camera."""
     return T_base_camera @ inverse(T_flange_camera)
 
 
 def _spread(i: int, approach: Array, side: Array) -> Array:
-    """Low-discrepancy offset in the horizontal plane, within ±1 (R2 sequence, Roberts 2018)."""
+    """Return a low-discrepancy offset in the horizontal plane, within ±1 (R2 sequence, Roberts 2018)."""
     u = (0.5 + 0.7548776662466927 * (i + 1)) % 1.0
     v = (0.5 + 0.5698402909980532 * (i + 1)) % 1.0
     return (2 * u - 1) * side + (2 * v - 1) * approach

@@ -67,7 +67,7 @@ class CaptureTotals:
     moved: int
 
     def measures(self) -> dict[str, float]:
-        """The totals under the names of measures."""
+        """Return the totals under the names of measures."""
         return {
             "viewpoints_planned": float(self.planned),
             "viewpoints_captured": float(self.captured),
@@ -79,21 +79,21 @@ class CaptureTotals:
 
 @dataclass(frozen=True, slots=True)
 class CaptureTask:
-    """What a capture loop is to do.
+    """The work of a capture loop.
 
     Attributes:
-        plan: of the motions: the viewpoints to capture, in order, and those that it leaves out, which are recorded as
-            given up.
+        plan: the plan of the motions: the viewpoints to capture, in order, and those that it leaves out, which are
+            recorded as given up.
         taken: further viewpoints of the step, which have their image; a person may ask for another while it runs.
         plan_anew: plans the motions to these viewpoints, in this order, from where the arms stand. Called if an arm
             stands elsewhere than where its way was planned to begin, as after a viewpoint that could not be taken.
         T_flange_camera: (4, 4) the best known mounting. It decides where the camera goes; what is recorded is the
             measured pose of the flange.
-        image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
+        image_kind: the artefact kind of the photographs (`image`, `board_image`, `control_image`).
         on_captured: called after each image is recorded; must return at once.
         stop: called before each viewpoint; if it returns True, the rest is not captured.
-        again: SHA-256 of images to take again.
-        all_cameras: whether the rig's further cameras expose as well.
+        again: the SHA-256 of images to take again.
+        all_cameras: true if the rig's further cameras expose as well.
     """
 
     plan: StepPlan
@@ -108,7 +108,7 @@ class CaptureTask:
 
     @property
     def names(self) -> list[str]:
-        """Of all viewpoints of the step."""
+        """The names of all viewpoints of the step."""
         return [viewpoint.name for viewpoint in (*self.plan.viewpoints, *self.taken)]
 
 
@@ -156,7 +156,7 @@ class _CaptureLoop:
     given_up: set[str] = field(init=False)
     _tried: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
     _held: Shot | None = field(init=False, default=None)
-    _size: str = field(init=False, default="")  # of an image, in words, once there is one
+    _size: str = field(init=False, default="")  # of an image, as text, once there is one
     _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (N,) solved ahead
     # By station, joints (N,) where the arm must stand when it is moved next: from where its motions were planned, and
     # then where it was sent last.
@@ -170,7 +170,7 @@ class _CaptureLoop:
 
     def run(self) -> None:
         """Capture what is missing. `keep` must be called afterwards, as the last image may still be held."""
-        # Determined anew each time, because an operator may have a viewpoint repeated while the arm moves.
+        # Determined again each time, because an operator may have a viewpoint repeated while the arm moves.
         while todo := self._next():
             self.context.checkpoint()
             if self.task.stop():
@@ -198,7 +198,7 @@ class _CaptureLoop:
             self.task.on_captured()
 
     def _next(self) -> list[Viewpoint]:
-        """The viewpoints still to capture, in order.
+        """Return the viewpoints still to capture, in order.
 
         An image whose verdicts failed is taken again, once per execution.
         """
@@ -265,7 +265,7 @@ class _CaptureLoop:
         raise AssertionError
 
     def _open_killed(self, robot: RobotArm, *, arrived: bool) -> None:
-        """Start the driver anew that was ended from outside, for the try after a person's answer."""
+        """Restart the driver that was ended from outside, for the try after a person's answer."""
         with suppress(DeviceError):  # that try says it again, also that it is another device
             if arrived:
                 self._reopen_cameras()
@@ -281,12 +281,12 @@ class _CaptureLoop:
             camera.apply(wanted)
 
     def _planned_from_here(self, robot: RobotArm, todo: Sequence[Viewpoint]) -> Sequence[Viewpoint]:
-        """The viewpoints still to capture, the way to the first of which was planned from where the arm stands.
+        """Return the viewpoints still to capture; the way to the first was planned from where the arm stands.
 
-        All are planned anew if it was not: after a viewpoint that could not be taken, or if one is taken again.
+        All are planned again if it was not: after a viewpoint that could not be taken, or if one is taken again.
 
         Raises:
-            UnreachablePoseError: from here the arm cannot take the first of them.
+            UnreachablePoseError: the arm cannot take the first of them from here.
         """
         first = todo[0]
         here_rad = robot.state().sample.joints_rad
@@ -351,7 +351,7 @@ class _CaptureLoop:
         return environment
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
-        """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
+        """Let the controller solve a viewpoint; return its joints (N,). Raises UnreachablePoseError."""
         target, near = flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), viewpoint.joints_rad
         return robot.solve_ik(target, robot.state().sample.joints_rad if near is None else near)
 
@@ -377,17 +377,17 @@ class _CaptureLoop:
 
 
 def _begins(viewpoint: Viewpoint, joints_rad: Array) -> bool:
-    """Whether the arm stands where the way to a viewpoint begins."""
+    """Return whether the arm stands where the way to a viewpoint begins."""
     return viewpoint.from_rad is not None and bool(np.abs(joints_rad - viewpoint.from_rad).max() <= _BEGINS_RAD)
 
 
 def _ends(viewpoint: Viewpoint, joints_rad: Array) -> bool:
-    """Whether the arm stands at a planned viewpoint already."""
+    """Return whether the arm stands at a planned viewpoint already."""
     return viewpoint.joints_rad is not None and bool(np.abs(joints_rad - viewpoint.joints_rad).max() <= _BEGINS_RAD)
 
 
 def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:
-    """One exposure without a robot, repeated with the camera reopened as often as the step's recovery allows.
+    """Take a photograph without a robot; repeat it with the camera reopened as often as the step's recovery allows.
 
     Raises DeviceError if it fails for good, StepInterruptedError on pause.
     """

@@ -23,7 +23,7 @@ _WHITE = 245.0  # an image counts as white if nearly all grey levels exceed this
 
 
 def board_of(size: BoardSize) -> Board:
-    """The board of a job's arguments."""
+    """Return the board of a job's arguments."""
     return Board(size.columns, size.rows, size.square_m)
 
 
@@ -52,12 +52,12 @@ def board_view(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def plain_reason(error: ComputeError) -> str:
-    """Why no board was found, without the details of the search."""
+    """Return why no board was found, without the details of the search."""
     return error.what.partition(" (searched")[0]
 
 
 def read_corners(record: job.Corners) -> BoardImage:
-    """The board in an image, from the file of `board_view`."""
+    """Return the board in an image, from the file of `board_view`."""
     indices, corners = np.array(record.indices, dtype=np.int64), np.array(record.corners, dtype=np.float64)
     return BoardImage(record.size, BoardView(indices, corners))
 

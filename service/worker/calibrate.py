@@ -76,7 +76,7 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def _board(arguments: job.Arguments) -> Board:
-    """The board as the protocol describes it, and bent as the camera's calibration has seen it."""
+    """Return the board as the protocol describes it, and bent as the camera's calibration has seen it."""
     board = board_of(arguments)
     if arguments.size_tolerance is not None:
         board = replace(board, size_tolerance=arguments.size_tolerance)
@@ -88,7 +88,7 @@ def _board(arguments: job.Arguments) -> Board:
 def _hand_eye(
     images: Sequence[PosedPhotograph], usable: UsableViews, board: Board, camera: CameraModel
 ) -> tuple[HandEye, dict[str, float]]:
-    """The whole record of the hand-eye calibration, and measures."""
+    """Return the whole record of the hand-eye calibration, and measures."""
     used = [images[i] for i in usable.indices]
     T_base_flange = np.array([image.T_base_flange for image in used])
     T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
@@ -135,7 +135,7 @@ def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
 def _intrinsics(
     usable: UsableViews, board: Board, names: Sequence[str]
 ) -> tuple[CameraModel, dict[str, float], Intrinsics]:
-    """The camera, measures, and the whole record of the calibration (`intrinsics_record`)."""
+    """Return the camera, measures, and the whole record of the calibration (`intrinsics_record`)."""
     solved = calibrate_intrinsics(usable.views, board, usable.size)
     validation = cross_validate(solved) if len(solved.views) >= MIN_VIEWS_TO_VALIDATE else None
     uncertainty = projection_uncertainty(solved, board_distance_m(solved))

@@ -113,7 +113,7 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def budget_record(budget: ErrorBudget) -> job.ErrorBudget:
-    """The record of an error budget, in millimetres."""
+    """Return the record of an error budget, in millimetres."""
     return job.ErrorBudget(
         contributions=tuple(
             job.Contribution(name=c.name, sigma_mm=mm(c.sigma_m), how=c.how, counted=c.counted)
@@ -165,7 +165,7 @@ class _Errors:
 
 
 def _errors(registered: _Registered, measured: _ScanAndCtSpheres) -> _Errors:
-    """The paper's two errors: on the control spheres or, without any, on each sphere predicted from the others."""
+    """Return the paper's two errors: on the control spheres or, without any, on each sphere predicted from others."""
     if not len(measured.control.centres_m):
         left_out = registered.record.leave_one_out
         if left_out is None:
@@ -187,7 +187,7 @@ def _errors(registered: _Registered, measured: _ScanAndCtSpheres) -> _Errors:
 
 
 def _measured(arguments: job.Arguments) -> _ScanAndCtSpheres:
-    """Scan, control scan and CT, matched by their spheres."""
+    """Match scan, control scan and CT by their spheres."""
     scan = _spheres(arguments.scan)
     control = _control(scan, arguments.control_scan)
     if arguments.ct is None:
@@ -201,7 +201,7 @@ def _measured(arguments: job.Arguments) -> _ScanAndCtSpheres:
 
 
 def _control(scan: MeasuredSpheres, control_scan: SpheresFound | None) -> MeasuredSpheres:
-    """The control spheres in the frame of the registered scan; none without a control scan."""
+    """Return the control spheres in the frame of the registered scan; none without a control scan."""
     if control_scan is None:
         return MeasuredSpheres(np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.0)
     both = _spheres(control_scan)
@@ -265,7 +265,7 @@ def _registered(
 
 
 class _Searched:
-    """What searches of the photographs found around control spheres, which registrations share."""
+    """The findings of searches around control spheres in the photographs, which registrations share."""
 
     def __init__(self, context: JobContext[job.Arguments]) -> None:
         self._context = context
@@ -274,7 +274,7 @@ class _Searched:
     def around(
         self, images: Sequence[PosedPhotograph], camera: CameraModel, record: Registration, expected: ExpectedNearby
     ) -> list[tuple[SphereOutline, ...]]:
-        """The outlines in images, by index, around cones; photographs are read only where this was not searched."""
+        """Return the outlines in images, by index, around cones; read only photographs not searched there before."""
         new: list[tuple[int, list[tuple[Cone, float]]]] = []
         for i, around in expected:
             known = self._known.setdefault((images[i].viewpoint, camera.width), [])
@@ -303,13 +303,13 @@ class _Searched:
 
 
 def _covers(entry: tuple[Cone, float, tuple[SphereOutline, ...]], cone: Cone, window_rad: float) -> bool:
-    """Whether an earlier search looked wherever one around a cone would."""
+    """Return whether an earlier search looked wherever one around a cone would."""
     there, wide_rad, _ = entry
     return window_rad + float(np.linalg.norm(there.axis - cone.axis)) < 1.2 * wide_rad
 
 
 def _budget(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float) -> ErrorBudget:
-    """The error budget at the centre of the control spheres, which is the middle of the anatomy."""
+    """Return the error budget at the centre of the control spheres, which is the middle of the anatomy."""
     record = registered.record
     T_world_scan = np.array(record.T_world_scan)
     target = (measured.control if len(measured.control.centres_m) else measured.scan).centres_m.mean(axis=0)
@@ -343,7 +343,7 @@ def _budget(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: floa
 def _overlays(
     context: JobContext[job.Arguments], registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float
 ) -> list[ArtefactRef]:
-    """One image of each station with detected and predicted outlines drawn over it."""
+    """Return one image of each station with detected and predicted outlines drawn over it."""
     first: dict[str, int] = {}
     for i, image in enumerate(registered.images):
         first.setdefault(image.station, i)

@@ -30,7 +30,7 @@ class FollowedRuns:
         self._logs: dict[str, RunFollower | None] = {}
 
     def resolved(self, job: Job) -> Mapping[str, Any]:
-        """A job's arguments with the references to earlier answers resolved.
+        """Return a job's arguments with the references to earlier answers resolved.
 
         Raises:
             IntegrityError: a reference has no answer that still counts.
@@ -78,7 +78,10 @@ class FollowedRuns:
             _log.warning("the record of %s could not be signed: %s", run_id, error)
 
     def _log_of(self, run_id: str) -> RunFollower | None:
-        """None for a run whose protocol this version cannot read: its jobs are computed, but none are added."""
+        """Return a run's follower; None if this version cannot read its protocol.
+
+        The jobs of such a run are computed, but none are added.
+        """
         if run_id not in self._logs:
             try:
                 protocol = recorded_protocol(self._store, recorded_root(self._store, run_id))

@@ -23,7 +23,7 @@ from service.worker.records import camera_used
 
 
 def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
-    """SIFT features of some images, one artefact for each, in the order of the images."""
+    """Compute SIFT features of some images, one artefact for each, in the order of the images."""
     cv2.setNumThreads(1)  # jobs run in parallel
     images = context.arguments.images
     files = photographs(context, images)
@@ -41,7 +41,7 @@ def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
 
 
 def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
-    """Geometrically verified matches of some pairs of images."""
+    """Match some pairs of images, and verify the matches geometrically."""
     arguments = context.arguments
     with _front_end(arguments) as front:
         found = front.match_pairs(read_features(context, arguments.features), arguments.pairs, context.progress)
@@ -53,7 +53,7 @@ def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
 
 
 def read_features(context: JobContext[Any], wanted: Mapping[str, Hash]) -> dict[str, ImageFeatures]:
-    """Features from their files, by image."""
+    """Read features from their files, by image."""
     return {name: ImageFeatures.from_bytes(context.input(sha256).read_bytes()) for name, sha256 in wanted.items()}
 
 
@@ -64,14 +64,14 @@ def read_matches(
     prior: Mapping[str, Transform],
     options: SfmOptions,
 ) -> list[PairMatches]:
-    """The matches of those pairs of images that their prior poses select, whenever they were computed.
+    """Return the matches of those pairs of images that their prior poses select, whenever they were computed.
 
     Args:
-        context: of the job.
-        files: of matches.
-        names: of the images.
+        context: the job's context.
+        files: the hashes of the files of matches.
+        names: the images' names.
         prior: T_world_camera by image, which select the pairs; empty if unknown.
-        options: of structure from motion.
+        options: the options of structure from motion.
     """
     wanted = set(pairs_of(names, prior or None, options))
     found = (m for sha256 in files for m in unpack_matches(context.input(sha256).read_bytes()))
@@ -80,7 +80,7 @@ def read_matches(
 
 
 class _ColmapChildren(threading.local):
-    """COLMAP's child process of each thread, by seed; kept, because starting one takes as long as an image."""
+    """COLMAP's child process of each thread, by seed; it stays, because starting one takes as long as an image."""
 
     def __init__(self) -> None:
         self.children: dict[int, ColmapProcess] = {}

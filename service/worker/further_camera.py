@@ -99,7 +99,7 @@ def _pose(context: JobContext[job.Arguments], views: Mapping[str, SightedPose], 
 def _lens_errors(
     context: JobContext[job.Arguments], first: job.FirstCamera, views: Iterable[str], spheres: ScanSpheres
 ) -> dict[str, Array]:
-    """(6, 6) by viewpoint: what the first camera's lens, its edges and the spheres do to its pose.
+    """Return the covariance (6, 6) of the first camera's pose by its lens, its edges and the spheres, by viewpoint.
 
     An error of the principal point turns the camera in its own frame, which the registration of the scan does not
     show. Viewpoints whose images do not locate the first camera by themselves are left out.
@@ -117,7 +117,7 @@ def _lens_errors(
 
 
 def _outlines(context: JobContext[job.Arguments], camera: CameraModel) -> dict[str, tuple[SphereOutline, ...]]:
-    """The outlines in every image, by viewpoint; measured in the developed raw files where there are any."""
+    """Return the outlines in every image, by viewpoint; measured in the developed raw files where there are any."""
     arguments = context.arguments
     files, options = [context.input(image.sha256) for image in arguments.images], options_for(arguments.colour)
     found = detect_all(
@@ -140,7 +140,7 @@ def _outlines(context: JobContext[job.Arguments], camera: CameraModel) -> dict[s
 def _views(
     outlines: Mapping[str, Sequence[SphereOutline]], lens: _Lens, spheres: ScanSpheres
 ) -> tuple[dict[str, SightedPose], dict[str, str]]:
-    """The pose from each image, and the images without one with the reason."""
+    """Return the pose from each image, and the images without one with the reason."""
     views: dict[str, SightedPose] = {}
     left_out: dict[str, str] = {}
     for name, found in outlines.items():
@@ -152,7 +152,7 @@ def _views(
 
 
 def _frames(first: job.FirstCamera, own: Mapping[str, Array]) -> Mapping[str, OuterFrame]:
-    """The first camera's poses, each with the sum of the registration's covariance and the pose's `own` one."""
+    """Return the first camera's poses, each with the registration's covariance plus the pose's `own` one."""
     T_world_scan, covariance = np.array(first.T_world_scan), np.array(first.covariance)[:6, :6]
     of_world = of_inverse(T_world_scan, covariance)
     nothing = np.zeros((6, 6))

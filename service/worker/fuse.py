@@ -90,7 +90,7 @@ def _settings(arguments: job.Arguments, aligned: Aligned) -> FusionSettings:
 
 
 def _frames(arguments: job.Arguments, aligned: Aligned) -> dict[str, Transform]:
-    """T_scan_frame by frame; without a registration there is no world."""
+    """Return T_scan_frame by frame; without a registration there is no world."""
     frames = {"scan": np.eye(4), "ct": aligned.T_scan_ct}
     if arguments.scan_registration is not None:
         frames["world"] = inverse(np.array(arguments.scan_registration.T_world_scan))
@@ -118,7 +118,7 @@ def _space(region: job.Region, T_scan_frame: Transform, up: Array) -> Box | Pris
 
 
 def _wound(fused: Fused, up: Array) -> tuple[Point, ...]:
-    """Corners of the wound's outline at its upper end; empty without a wound."""
+    """Return the corners of the wound's outline at its upper end; empty without a wound."""
     points = fused.surface.vertices_m[fused.wound]
     if len(points) < 3:
         return ()
@@ -128,7 +128,7 @@ def _wound(fused: Fused, up: Array) -> tuple[Point, ...]:
 
 
 def _loop(arguments: job.Arguments, aligned: Aligned) -> TransformLoop | None:
-    """Around by the spheres and back by the cameras; None without images."""
+    """Close the loop: there by the spheres and back by the cameras; None without images."""
     of_ct, of_scan = arguments.ct_registration, arguments.scan_registration
     if of_ct is None or of_scan is None:
         return None

@@ -44,18 +44,18 @@ _H = TypeVar("_H", bound=HeldArguments)
 
 @dataclass(frozen=True, slots=True)
 class HandheldImage:
-    """An image that a person took, and what it contributes.
+    """An image that a person took, and its contribution.
 
     Attributes:
         viewpoint: its name.
-        used: whether it counts.
-        T_scene_camera: None where the image does not show where the camera was.
-        T_scene_level: frame with z up and y towards the top of the first image whose pose is known.
-        information: (6, 6) about the scan's pose.
-        seen: (P,) points of the surface that it shows.
-        cells: board corners in each cell of the frame; empty for images of the specimen.
-        reading: outlines and spheres, where the spheres have not been measured.
-        spheres_m: (S, 3) as the images up to this one show them.
+        used: true if it counts.
+        T_scene_camera: the camera's pose, (4, 4); None where the image does not show where the camera was.
+        T_scene_level: the frame with z up and y towards the top of the first image whose pose is known.
+        information: (6, 6) information about the scan's pose.
+        seen: (P,) mask of the points of the surface that it shows.
+        cells: the number of board corners in each cell of the frame; empty for images of the specimen.
+        reading: the outlines and spheres, where the spheres have not been measured.
+        spheres_m: (S, 3) centres as the images up to this one show them.
     """
 
     viewpoint: str
@@ -69,7 +69,7 @@ class HandheldImage:
     spheres_m: Array | None = field(repr=False)
 
     def plain(self, *, rough: bool) -> dict[str, object]:
-        """The view as it is written into its file; with `rough`, the spheres too."""
+        """Return the view as it is written into its file; with `rough`, the spheres too."""
         record: dict[str, object] = {
             "viewpoint": self.viewpoint,
             "used": self.used,
@@ -86,7 +86,7 @@ class HandheldImage:
 
 
 def read_views(context: JobContext[_H], scene: CaptureScene) -> list[HandheldImage]:
-    """The views of the earlier images, from their files."""
+    """Return the views of the earlier images, from their files."""
     return [_read(context, sha256, scene) for sha256 in context.arguments.earlier]
 
 
@@ -122,8 +122,8 @@ class HandGuide:
     """The state of a capture by hand after one more image.
 
     Attributes:
-        arguments: of the job.
-        scene: with the spheres as they are known now.
+        arguments: the job's arguments.
+        scene: the scene with the spheres as they are known now.
         new: the new image.
         earlier: all images before it, in order.
         good: the images that count and whose pose is known, the new one included.
@@ -136,16 +136,16 @@ class HandGuide:
     good: Sequence[HandheldImage]
 
     def places(self) -> list[WantedView]:
-        """The planned places."""
+        """Return the planned places."""
         return [_place(spot) for spot in self.arguments.places]
 
     def done(self) -> set[str]:
-        """Names of the planned places that have an image."""
+        """Return the names of the planned places that have an image."""
         level = self.new.T_scene_level
         return covered(self.places(), [] if level is None else self._poses(level), self.arguments.within_deg)
 
     def totals(self) -> dict[str, float]:
-        """The numbers of all images that count."""
+        """Return the numbers of all images that count."""
         places, measures = self.places(), {"images_used": float(len(self.good))}
         measures["hemisphere_coverage"] = len(self.done()) / len(places)
         if not isinstance(self.arguments, job.Arguments) or not len(self.scene.spheres_m):
@@ -160,7 +160,7 @@ class HandGuide:
         return measures
 
     def next_place(self) -> tuple[str, WantedView | None]:
-        """Directions to the next place, and the place; those for the first image if the pose was lost repeatedly."""
+        """Return directions to the next place, and the place; those for the first image after repeated loss."""
         T, level = self.new.T_scene_camera, self.new.T_scene_level
         if T is None or level is None:
             return (self.arguments.first_words if self._lost() >= _LOST_AFTER else AGAIN), None
@@ -187,7 +187,7 @@ class HandGuide:
         return [inverse(level) @ v.T_scene_camera for v in self.good if v.T_scene_camera is not None]
 
     def _information(self, arguments: job.Arguments) -> CurrentInformation:
-        """The images as measurements of the scan's pose, with the camera poses expected of structure from motion."""
+        """Return the images as measurements of the scan's pose, with poses as expected of structure from motion."""
         sigma_m, sigma_rad = arguments.pose_sigma_m, arguments.pose_sigma_rad
         seen = np.array([v.seen for v in self.good], dtype=np.int64).reshape(len(self.good), self.scene.n_points)
         return CurrentInformation(
@@ -200,7 +200,7 @@ class HandGuide:
         )
 
     def _shared(self, arguments: job.Arguments) -> Array:
-        """(6, 6) covariance that all images share, as the error budget counts it: edges, calibration and scan."""
+        """Return the (6, 6) covariance that all images share by the error budget: edges, calibration and scan."""
         scene, centre_m = self.scene, self.scene.spheres_m.mean(axis=0)
         placed = [(v.information, v.T_scene_camera) for v in self.good if v.T_scene_camera is not None]
         if not placed:
@@ -215,7 +215,7 @@ class HandGuide:
         return shared + lens_covariance_of_pose(placed, scene.camera, lens, centre_m)
 
     def _most_helpful(self, arguments: job.Arguments, T_scene_level: Transform) -> WantedView | None:
-        """The most helpful view of a denser hemisphere, once every planned place has its image."""
+        """Return the most helpful view of a denser hemisphere, once every planned place has its image."""
         scene, taken = self.scene, self._poses(T_scene_level)
         distance_m = float(np.median([spot.distance_m for spot in arguments.places]))
         typical = (_TYPICAL_PX / scene.camera.fx) ** 2 * np.eye(3)
@@ -271,17 +271,17 @@ _SAME_M, _SAME_RAD = 0.02, np.deg2rad(3.0)  # an image nearer than this to anoth
 
 @dataclass(frozen=True, slots=True)
 class NewImage:
-    """What can be determined from the new image alone.
+    """The facts that can be determined from the new image alone.
 
     Attributes:
-        T_scene_camera: None if the pose cannot be determined.
-        why: why it cannot be used; "" if it can.
-        measures: numbers of this image.
-        information: (6, 6) about the scan's pose.
+        T_scene_camera: the camera's pose, (4, 4); None if it cannot be determined.
+        why: the reason why it cannot be used; "" if it can.
+        measures: the numbers of this image.
+        information: (6, 6) information about the scan's pose.
         up: (3,) direction away from the table, frame of the scene.
-        middle_m: (3,) of the scene.
-        cells: board corners in each cell of the frame.
-        reading: outlines and spheres, where the spheres have not been measured.
+        middle_m: (3,) middle of the scene.
+        cells: the number of board corners in each cell of the frame.
+        reading: the outlines and spheres, where the spheres have not been measured.
     """
 
     T_scene_camera: Transform | None
@@ -324,7 +324,7 @@ def answer_to(
 
 
 def _level(found: NewImage, earlier: Sequence[HandheldImage]) -> Transform | None:
-    """T_scene_level of the first image that had one, else of this image if its pose is known."""
+    """Return T_scene_level of the first image that had one, else of this image if its pose is known."""
     level = next((view.T_scene_level for view in earlier if view.T_scene_level is not None), None)
     if level is None and found.T_scene_camera is not None:
         level = level_frame(found.middle_m, found.up, -found.T_scene_camera[:3, 1])
@@ -364,7 +364,7 @@ def _pose(place: WantedView) -> Matrix:
 
 
 def _repeats(T: Transform | None, used: Sequence[HandheldImage]) -> str:
-    """Why an image adds nothing to the earlier ones, or ""."""
+    """Return why an image adds nothing to the earlier ones, or ""."""
     if T is None:
         return ""
     same = [

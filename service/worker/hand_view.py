@@ -58,7 +58,7 @@ def hand_view(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def _scene(context: JobContext[job.Arguments]) -> tuple[CaptureScene, list[HandheldImage]]:
-    """The scene, with the spheres as the last image left them, and the earlier images."""
+    """Return the scene, with the spheres as the last image left them, and the earlier images."""
     arguments = context.arguments
     scene = CaptureScene(
         camera_of(arguments.camera),

@@ -29,14 +29,14 @@ _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMW
 
 
 def photographs(context: JobContext[_A], images: Sequence[ImageFile]) -> list[Path]:
-    """One file per image: the original, or a reduced copy if the job asks for it."""
+    """Return one file per image: the original, or a reduced copy if the job asks for it."""
     return photographs_at(context, images, camera_used(context.arguments), camera_reduced(context.arguments))
 
 
 def photographs_at(
     context: JobContext[_J], images: Sequence[ImageFile], camera: CameraModel, full: CameraModel | None
 ) -> list[Path]:
-    """One file per image at a camera's size: the original, or a copy reduced from that of the `full` camera."""
+    """Return one file per image at a camera's size: the original, or a copy reduced from the `full` camera's."""
     originals = [context.input(image.sha256) for image in images]
     if full is None:
         return originals
@@ -57,12 +57,12 @@ def _reduce(original: Path, copy: Path, full: CameraModel, width: int, height: i
 
 
 def robot_camera_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> Array:
-    """(N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
+    """Return (N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
 
     Args:
-        mounting: of the camera on the arm.
-        images: with `T_scene_camera` of a hand-held camera, or with `T_base_flange`; for a correction also with
-            `station` and `joints_rad`.
+        mounting: the camera's mounting on the arm.
+        images: the images, with `T_scene_camera` of a hand-held camera, or with `T_base_flange`; for a correction
+            also with `station` and `joints_rad`.
 
     Raises:
         DataError: the joints are not of the corrected arm.

@@ -21,7 +21,10 @@ class ArtefactStore(Protocol):
     """The part of the store that a job needs; in a replay it reads the evidence but writes elsewhere."""
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The read-only file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
+        """Return the read-only file of an artefact.
+
+        Raises IntegrityError if it is missing or, with `verify`, altered.
+        """
         ...
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
@@ -49,7 +52,7 @@ class JobAnswer:
 
 @dataclass(frozen=True, slots=True)
 class JobContext(Generic[A]):
-    """What a job may use: its arguments, verified inputs, a scratch folder and the store for its outputs.
+    """A job's surroundings: its arguments, verified inputs, a scratch folder and the store for its outputs.
 
     `begin` surrounds the computation: a worker waits there until the machine has what the job demands.
     """
@@ -61,11 +64,11 @@ class JobContext(Generic[A]):
     begin: Callable[[Demand], AbstractContextManager[None]] = lambda _demand: nullcontext()
 
     def input(self, sha256: str) -> Path:
-        """An artefact's file, its hash verified."""
+        """Return an artefact's file after its hash was verified."""
         return self.store.artefact_path(sha256, verify=True)
 
     def input_json(self, sha256: str) -> Any:
-        """An artefact's JSON content."""
+        """Return an artefact's JSON content."""
         return json.loads(self.input(sha256).read_bytes())
 
     def keep_json(self, data: Any, *, kind: str, name: str) -> ArtefactRef:
@@ -83,7 +86,7 @@ class JobContext(Generic[A]):
 
 
 def finite(measures: Mapping[str, float]) -> dict[str, float]:
-    """The measures that are numbers: what could not be measured is NaN or infinite, and left out of an answer."""
+    """Return the measures that are numbers: those not measured are NaN or infinite, and left out of an answer."""
     return {name: value for name, value in measures.items() if math.isfinite(value)}
 
 
@@ -92,7 +95,7 @@ Handler = Callable[[RecordedContext], JobAnswer]
 
 
 def handler_of(kind: JobKind[Any, Any]) -> Handler:
-    """The function that computes a kind, from arguments with references resolved.
+    """Return the function that computes a kind, from arguments with references resolved.
 
     Its module is imported at the first such job, so that a worker starts at once.
     """

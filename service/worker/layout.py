@@ -99,7 +99,7 @@ def _not_wider(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: float) -> CameraModel:
-    """Nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
+    """Return nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
 
     Raises:
         DataError: the file does not state its focal length.
@@ -116,7 +116,7 @@ def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: fl
 def _moves(
     found: PhotoLayout, report: LayoutReport, camera: CameraModel, radius_m: float, control: int
 ) -> list[PhotographedMove]:
-    """The spheres to move, in the last photograph; none if the layout is good or no move would help."""
+    """Return the spheres to move, in the last photograph; none if the layout is good or no move would help."""
     T = found.T_photo_first[-1]
     if T is None or all(bounded.lower_m >= limit for bounded, limit in layout_bounds(report).values()):
         return []
@@ -135,7 +135,7 @@ def _moves(
 
 
 def _up(centres: Array) -> Array:
-    """(3,) Normal of the spheres' best plane, pointing away from the table, towards the camera."""
+    """Return the normal (3,) of the spheres' best plane, which points away from the table, towards the camera."""
     _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
     return np.asarray(axes[2] if axes[2, 2] < 0 else -axes[2], dtype=np.float64)
 
@@ -146,7 +146,7 @@ def _searched(ids: NDArray[np.int64], outlines: Sequence[SphereOutline]) -> job.
 
 
 def _move_record(move: PhotographedMove, camera: CameraModel) -> job.SphereMove:
-    """The move as recorded; places are fractions of the image's width and height."""
+    """Return the move as recorded; places are fractions of the image's width and height."""
     size = np.array([camera.width, camera.height])
     places = {"from": (move.from_px / size).tolist(), "to": (move.to_px / size).tolist()}
     return job.SphereMove.model_validate({"words": move.words, **places, "higher_mm": mm(move.higher_m)})
@@ -159,7 +159,7 @@ def _picture(
     ids: NDArray[np.int64],
     moves: Sequence[PhotographedMove],
 ) -> bytes:
-    """JPEG of the photograph with numbered spheres, and arrows for the moves."""
+    """Return a JPEG of the photograph with numbered spheres, and arrows for the moves."""
     picture = pixels.copy()
     thick = max(1, round(camera.width / 900))
     curves = [outline.captured_px(camera) for outline in outlines]
@@ -179,10 +179,10 @@ def _draw_move(picture: NDArray[np.uint8], move: PhotographedMove, outline: Arra
     """Draw the new place of a sphere, and an arrow from rim to rim, which leaves the number legible.
 
     Args:
-        picture: drawn into.
+        picture: the picture that is drawn into.
         move: the move.
         outline: (n, 2) pixels of the sphere's outline about its middle.
-        thick: width of a thin line, in pixels.
+        thick: the width of a thin line, in pixels.
     """
     way = move.to_px - move.from_px
     length = float(np.linalg.norm(way))
@@ -206,5 +206,5 @@ def _draw_number(picture: NDArray[np.uint8], text: str, curve: Array, thick: int
 
 
 def _sixteenths(curve: Array) -> NDArray[np.int32]:
-    """Pixels as OpenCV expects them with four fractional bits."""
+    """Return pixels as OpenCV expects them, with four fractional bits."""
     return np.rint(curve * 16).astype(np.int32)

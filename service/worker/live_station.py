@@ -42,7 +42,7 @@ class LiveRecord:
     seen: NDArray[np.bool_]
 
     def plain(self, sha256: str) -> dict[str, object]:
-        """The record as it is written, with the hash of the photograph."""
+        """Return the record as it is written, with the hash of the photograph."""
         return {
             "viewpoint": self.viewpoint,
             "station": self.station,
@@ -55,7 +55,7 @@ class LiveRecord:
 
 
 def read_records(context: JobContext[_L], hashes: Sequence[Hash], scene: CaptureScene) -> list[LiveRecord]:
-    """The records of earlier images, from their files."""
+    """Return the records of earlier images, from their files."""
     out: list[LiveRecord] = []
     for sha256 in hashes:
         data = context.input_json(sha256)
@@ -71,7 +71,7 @@ def read_records(context: JobContext[_L], hashes: Sequence[Hash], scene: Capture
 
 
 def last_known(records: Sequence[LiveRecord]) -> Transform | None:
-    """The newest T_base_scan of a station's images; None before one is determined."""
+    """Return the newest T_base_scan of a station's images; None before one is determined."""
     return next((r.T_base_scan for r in reversed(records) if r.T_base_scan is not None), None)
 
 
@@ -81,10 +81,10 @@ class LiveStation:
 
     Attributes:
         solved: the registration.
-        informations: of each image, about the scan's pose.
+        informations: the information of each image about the scan's pose.
         P: (6, 6) covariance of one camera pose of the arm.
         mounting: (6, 6) covariance of the scan's pose due to the hand-eye transform.
-        centre_m: (3,) of the spheres, base frame.
+        centre_m: (3,) centre of the spheres, base frame.
         targets_m: (T, 3) points at which errors are predicted, relative to the centre, base axes.
     """
 
@@ -96,11 +96,11 @@ class LiveStation:
     targets_m: Array
 
     def error_m(self) -> float:
-        """Predicted error (1σ, 3D) at the worst target."""
+        """Predict the error (1σ, 3D) at the worst target."""
         return self._worst_m(pose_covariance([v.information for v in self.informations], self.P) + self.mounting)
 
     def outline_limited_m(self) -> float:
-        """Predicted error (1σ, 3D) at the worst target if the camera poses were exact."""
+        """Predict the error (1σ, 3D) at the worst target if the camera poses were exact."""
         return self._worst_m(pose_covariance([v.information for v in self.informations], np.zeros((6, 6))))
 
     def _worst_m(self, covariance: Array) -> float:

@@ -19,7 +19,7 @@ from service.worker.scene import CaptureScene, live_scene
 
 
 def live_summary(context: JobContext[job.Arguments]) -> JobAnswer:
-    """The predicted error of the worst station, the coverage, and suggestions for the robot's present station."""
+    """Compute the error predicted for the worst station, the coverage, and suggestions for the robot's station."""
     scene = live_scene(context)
     records = read_records(context, context.arguments.views, scene)
     stations, reasons = _stations(context.arguments, scene, records)
@@ -44,7 +44,7 @@ def live_summary(context: JobContext[job.Arguments]) -> JobAnswer:
 def _stations(
     arguments: job.Arguments, scene: CaptureScene, records: Sequence[LiveRecord]
 ) -> tuple[dict[str, LiveStation], dict[str, str]]:
-    """The registration of each station that its images determine, and for each other station why they do not."""
+    """Return the registration of each station that its images determine; for the others, why they do not."""
     stations: dict[str, LiveStation] = {}
     reasons: dict[str, str] = {}
     for name in dict.fromkeys(record.station for record in records):
@@ -82,7 +82,7 @@ def _suggestions(
 def _candidates(
     arguments: job.Arguments, scene: CaptureScene, here: LiveStation, records: Sequence[LiveRecord]
 ) -> list[ViewGain]:
-    """The information that each candidate view would add, with outlines as precise as those seen so far."""
+    """Return the information that each candidate view would add, with outlines as precise as those seen so far."""
     spheres, radius_m = scene.spheres_m, scene.radius_m
     typical = np.median([o.cone_covariance for r in records for o in r.view.outlines], axis=0)
     typical = np.diag(np.diag(typical))  # a median of matrices need not be positive definite

@@ -56,7 +56,7 @@ def live_view(context: JobContext[job.Arguments]) -> JobAnswer:
 def _prediction(
     scene: CaptureScene, mine: Sequence[LiveRecord], known: Transform | None, T_base_camera: Transform
 ) -> PredictedSpheres | None:
-    """Where the image should show the spheres; None before the station is registered."""
+    """Predict where the image should show the spheres; None before the station is registered."""
     shown = [outline for record in mine for outline in record.view.outlines]
     if known is None or not shown:
         return None
@@ -64,7 +64,7 @@ def _prediction(
 
 
 def _station_measures(station: LiveStation, view: LiveView, scene: CaptureScene) -> dict[str, float]:
-    """The numbers of the registration so far, and of the new image in it."""
+    """Return the numbers of the registration so far, and of the new image in it."""
     solved = station.solved
     T_camera_scan = inverse(view.T_base_camera) @ solved.T_base_scan
     residuals = solved.registration.residuals

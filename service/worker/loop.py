@@ -51,17 +51,17 @@ def work(
     """Compute one job after the other until `stop()`.
 
     Args:
-        store: of the data folder.
-        until_idle: end when no job is left.
+        store: the data folder's store.
+        until_idle: true to end when no job is left.
         stop: called between jobs.
         progress: called with what a job does, how much is done, and the total.
-        lane: only jobs that a step waits for, or only the others; None: all.
+        lane: the lane of jobs to compute: those that a step waits for, or the others; None: all.
         finished: called after each job.
         end: called from another thread when the job that is computed has been cancelled, or has taken too long; ends
             the process if the computation is to end with it.
 
     Returns:
-        the number of jobs computed.
+        The number of jobs computed.
     """
     name = f"worker {socket.gethostname()}:{os.getpid()}"
     following: FollowedRuns | None = None
@@ -93,7 +93,7 @@ def _disk_full(store: Store, *, told: bool) -> bool:
 
 
 def _following(store: Store) -> FollowedRuns:
-    """Imported at the first job, like the job's function."""
+    """Make the follower; its module is imported at the first job, like the job's function."""
     from service.worker.following import FollowedRuns  # noqa: PLC0415 - it imports all step kinds, which takes a second
 
     return FollowedRuns(store)
@@ -136,7 +136,7 @@ def _do(
 
 
 def _worth_another_try(error: Exception) -> bool:
-    """Whether an error may be temporary; a job that refuses its input would refuse it again."""
+    """Return whether an error may be temporary; a job that refuses its input would refuse it again."""
     if isinstance(error, OrthocaptureError):
         return not isinstance(error, (ComputeError, IntegrityError))
     return isinstance(error, BrokenProcessPool)  # a helper of the job was killed

@@ -75,7 +75,7 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
 
 
 def _covered(T_ct_voxel: Array, slices: int) -> str:
-    """What slices cover along their normal, in words: half a series without a gap looks whole."""
+    """Say what slices cover along their normal: half a series without a gap looks whole."""
     normal = np.cross(T_ct_voxel[:3, 0], T_ct_voxel[:3, 1])
     normal /= np.linalg.norm(normal)
     first_m = float(normal @ T_ct_voxel[:3, 3])
@@ -88,7 +88,7 @@ def _covered(T_ct_voxel: Array, slices: int) -> str:
 
 
 def _contrast(arguments: ct_job.Arguments, hounsfield: Any, T_ct_voxel: Array, centres: Array) -> float:
-    """The least contrast, in HU, of the spheres (N, 3) of a segmentation in the volume that it segments.
+    """Return the least contrast, in HU, of the spheres (N, 3) of a segmentation in the volume that it segments.
 
     Raises ComputeError if there are none: the segmentation is mirrored, or of another series.
     """
@@ -124,7 +124,7 @@ def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
 def search_spheres(
     arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Array, faces: Any
 ) -> tuple[dict[str, float], SpheresFound]:
-    """The measures and the spheres of a mesh."""
+    """Return the measures and the spheres of a mesh."""
     radius_m = arguments.radius_m
     spheres = found_spheres(vertices_m, faces, radius_m, arguments.expected)
     centres = np.array([s.centre_m for s in spheres])
@@ -163,7 +163,7 @@ def search_spheres(
 def found_spheres(
     vertices_m: Array, faces: Any, radius_m: float, expected: int | None = None
 ) -> tuple[MeshSphere, ...]:
-    """The spheres, of any number or `expected`; if they are missing because of the mesh's unit, the error says so."""
+    """Return the spheres, of any number or `expected`; an error says so if they are missing because of the unit."""
     try:
         return find_spheres(vertices_m, faces, radius_m, expected)
     except ComputeError as error:

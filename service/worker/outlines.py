@@ -33,11 +33,11 @@ from service.worker.records import camera_used
 
 
 def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
-    """Outlines of every sphere in every image, as one artefact that all registrations share.
+    """Detect the outlines of every sphere in every image, as one artefact that all registrations share.
 
     Poses predict where to search: the robot's, or those of a `model` from structure from motion, which has no scale.
-    Without poses, or if they are too inaccurate, the images are searched whole. Images that the model lacks get no
-    outlines.
+    Without poses, or if they are too inaccurate, the images are searched whole. Images that are not in the model get
+    no outlines.
     """
     arguments = context.arguments
     images, poses = _posed(context)
@@ -63,13 +63,13 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
 def read_outlines(
     read: Callable[[Hash], Any], outlines: Hash, images: Sequence[PosedPhotograph], camera: CameraModel
 ) -> list[list[SphereOutline]]:
-    """The outlines in each image, from the file that `detect_spheres` wrote; `read` gives the content of a file."""
+    """Return the outlines in each image, from the file of `detect_spheres`; `read` gives the content of a file."""
     found = read(outlines)
     return [[outline_from_record(record, camera) for record in found[image.viewpoint]] for image in images]
 
 
 def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[PosedPhotograph], Array | None]:
-    """The images to search, and (N, 4, 4) their poses; None: those of the robot."""
+    """Return the images to search, and (N, 4, 4) their poses; None: those of the robot."""
     arguments = context.arguments
     if arguments.model is None:
         return arguments.images, None
@@ -83,7 +83,7 @@ def _measured(
     images: Sequence[PosedPhotograph],
     outlines: Sequence[tuple[SphereOutline, ...]],
 ) -> tuple[Sequence[tuple[SphereOutline, ...]], dict[str, float]]:
-    """The outlines measured in the developed raw files, where there are any, and how many these do not show."""
+    """Return the outlines measured in developed raw files, where there are any, and how many these do not show."""
     arguments = context.arguments
     if arguments.developed is None:
         return outlines, {}
@@ -136,7 +136,7 @@ def _located(
 
 
 def _numbered(names: Iterable[str]) -> list[int]:
-    """A number for each name; equal names have equal numbers."""
+    """Return a number for each name; equal names have equal numbers."""
     numbers: dict[str, int] = {}
     return [numbers.setdefault(name, len(numbers)) for name in names]
 

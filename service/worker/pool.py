@@ -94,11 +94,11 @@ class Pool:
 
     @property
     def busy(self) -> bool:
-        """Whether a living child has started a job and not reported its end."""
+        """True if a living child has started a job and not reported its end."""
         return any(child.busy and child.died_s is None for child in self._children)
 
     def pids(self) -> list[int]:
-        """The children's process ids, in the order in which they were started."""
+        """Return the children's process ids, in the order in which they were started."""
         return [child.process.pid or 0 for child in self._children]
 
     def __enter__(self) -> Pool:
@@ -143,7 +143,7 @@ def work_side_by_side(
     Args:
         data: the data folder.
         at_once: number of background jobs in parallel; there may be as many again that a step waits for.
-        until_idle: end when no job is open.
+        until_idle: true to end when no job is open.
         stop: called several times a second.
         progress: called with what a job does, how much is done, and the total.
 
@@ -168,7 +168,7 @@ def work_side_by_side(
 
 
 def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int) -> None:
-    """Entry point of a child."""
+    """Run a child: its entry point."""
     show_own_words_only()
     os.setsid()  # Ctrl-C must reach only the worker, which ends its children and their processes
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()

@@ -149,7 +149,7 @@ def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> hybri
 
 
 def _packed(model: SfmModel, joint_pose_covariance: Array) -> bytes:
-    """The tracks and the joint covariance of the poses as a compressed NumPy archive, images by name."""
+    """Return the tracks and the joint covariance of the poses as a compressed NumPy archive, images by name."""
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -164,7 +164,7 @@ def _packed(model: SfmModel, joint_pose_covariance: Array) -> bytes:
 
 
 def joint_pose_covariance(data: bytes, names: Sequence[str]) -> Array:
-    """(6 N, 6 N) Covariance of the poses in a packed model, for the named images in their order."""
+    """Return the (6 N, 6 N) covariance of the poses in a packed model, for the named images in their order."""
     with np.load(io.BytesIO(data)) as archive:
         order = json.loads(str(archive["names"]))
         rows = (6 * np.array([order.index(name) for name in names])[:, None] + np.arange(6)).ravel()
@@ -172,7 +172,7 @@ def joint_pose_covariance(data: bytes, names: Sequence[str]) -> Array:
 
 
 def _unpacked(data: bytes, names: list[str]) -> Tracks:
-    """The tracks of a packed model, with images numbered as in `names`."""
+    """Return the tracks of a packed model, with images numbered as in `names`."""
     with np.load(io.BytesIO(data)) as archive:
         order = json.loads(str(archive["names"]))
         number = np.array([names.index(name) for name in order], dtype=np.int64)

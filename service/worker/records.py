@@ -37,17 +37,17 @@ from service.jobs.records import (
 
 
 def camera_of(record: Camera) -> CameraModel:
-    """The camera model of a record."""
+    """Return the camera model of a record."""
     return CameraModel.from_record(record.plain())
 
 
 def camera_record(camera: CameraModel) -> Camera:
-    """The record of a camera model."""
+    """Return the record of a camera model."""
     return Camera.model_validate(camera.record())
 
 
 def lens_covariance(record: Matrix | ParameterCovariance | None) -> Array | None:
-    """(8, 8) covariance of the intrinsics in a record; None if it is unknown, or belongs to another lens model."""
+    """Return the intrinsics' covariance (8, 8) of a record; None if unknown, or that of another lens model."""
     if record is None:
         return None
     if not isinstance(record, ParameterCovariance):
@@ -56,13 +56,13 @@ def lens_covariance(record: Matrix | ParameterCovariance | None) -> Array | None
 
 
 def camera_used(arguments: ImagesCamera) -> CameraModel:
-    """The camera at the size of the images that a job uses."""
+    """Return the camera at the size of the images that a job uses."""
     camera = camera_of(arguments.camera)
     return camera if arguments.reduced_to is None else camera_at(camera, *arguments.reduced_to)
 
 
 def camera_reduced(arguments: ImagesCamera) -> CameraModel | None:
-    """The camera at the size of the photographs if the job uses reduced copies of them; else None."""
+    """Return the camera at the size of the photographs if the job uses reduced copies of them; else None."""
     if arguments.reduced_to is not None:
         return camera_of(arguments.camera)
     return None if arguments.full_camera is None else camera_of(arguments.full_camera)
@@ -79,15 +79,15 @@ def intrinsics_record(
     names: Sequence[str],
     excluded: Mapping[str, str],
 ) -> calibration_records.Intrinsics:
-    """Everything but the camera itself; unknown numbers are None.
+    """Return everything but the camera itself; unknown numbers are None.
 
     Args:
         result: the calibration.
-        validation: None if there are too few images.
-        uncertainty: of a projected point.
-        warnings: about the images.
-        names: of the images used, in the order of `result.views`.
-        excluded: reason by image name, including images without the board.
+        validation: the cross-validation; None if there are too few images.
+        uncertainty: the uncertainty of a projected point.
+        warnings: sentences of warning about the images.
+        names: the names of the images used, in the order of `result.views`.
+        excluded: the reason by image name, including images without the board.
     """
     return calibration_records.Intrinsics(
         model=result.model,
@@ -117,7 +117,7 @@ def intrinsics_record(
 def hand_eye_record(
     result: HandEyeResult, images: Sequence[str], setup: Setup = "eye-in-hand"
 ) -> calibration_records.HandEye:
-    """The whole result of a hand-eye calibration; `images` are the names of its views."""
+    """Return the whole result of a hand-eye calibration; `images` are the names of its views."""
     chosen = result.T_flange_camera
     methods: dict[str, calibration_records.HandEyeMethod] = {}
     for name, T in result.methods.items():
@@ -152,7 +152,7 @@ def hand_eye_record(
 
 
 def arm_correction_record(correction: ArmCorrection, T_flange_camera: Transform) -> shared.ArmCorrection:
-    """A correction, and the camera's pose on the flange (4, 4) for corrected poses."""
+    """Return a correction, and the camera's pose on the flange (4, 4) for corrected poses."""
     return shared.ArmCorrection(
         T_flange_camera=matrix(T_flange_camera),
         arm=correction.arm,
@@ -165,7 +165,7 @@ def arm_correction_record(correction: ArmCorrection, T_flange_camera: Transform)
 
 
 def corrected_mounting(record: shared.ArmCorrection) -> CorrectedMounting:
-    """The correction of a record as arrays.
+    """Return the correction of a record as arrays.
 
     Raises:
         DataError: a matrix has another shape.
@@ -187,7 +187,7 @@ def corrected_mounting(record: shared.ArmCorrection) -> CorrectedMounting:
 
 
 def _five_columns(dh_deltas: Array) -> Array:
-    """Deltas with those of β, which calibrations of before version 4 did not have."""
+    """Return deltas with those of β, which calibrations of before version 4 did not have."""
     if dh_deltas.ndim != 2 or dh_deltas.shape[1] != 4:
         return dh_deltas
     return np.concatenate([dh_deltas, np.zeros((len(dh_deltas), 1))], axis=1)
@@ -253,7 +253,7 @@ def _board(result: IntrinsicsResult) -> calibration_records.BoardSeen:
 
 
 def seen_board(board: Board, seen: calibration_records.BoardSeen | None) -> Board:
-    """The board as a calibration of the camera has found it to be bent, if it saw this board."""
+    """Return the board as a calibration of the camera has found it to be bent, if it saw this board."""
     if seen is None or seen.bow_mm is None:
         return board
     if (seen.pattern, seen.columns, seen.rows) != (board.pattern, board.columns, board.rows):
@@ -307,12 +307,12 @@ def _number(value: float) -> float | None:
 
 
 def _rounded(values: Array) -> Matrix:
-    """To four digits."""
+    """Round to four significant digits."""
     return tuple(tuple(float(f"{value:.4g}") for value in row) for row in values)
 
 
 def measured_sphere(sphere: MeshSphere) -> MeasuredSphere:
-    """The record of a sphere found in a mesh."""
+    """Return the record of a sphere found in a mesh."""
     x, y, z = sphere.centre_m.tolist()
     return MeasuredSphere(
         centre_m=(x, y, z),
@@ -327,7 +327,7 @@ def measured_sphere(sphere: MeshSphere) -> MeasuredSphere:
 
 
 def judged_layout(report: LayoutReport) -> JudgedLayout:
-    """The record of a layout's report."""
+    """Return the record of a layout's report."""
     return JudgedLayout(
         passed=report.passed,
         problems=report.problems,

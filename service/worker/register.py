@@ -40,7 +40,7 @@ _LEAST_SPHERES = 4
 
 
 def register(context: JobContext[job.Arguments]) -> JobAnswer:
-    """T_world_scan for one source of poses. With robot poses, every station has its own base frame."""
+    """Compute T_world_scan for one source of poses. With robot poses, every station has its own base frame."""
     arguments, source = context.arguments, context.arguments.poses
     free = source == "spheres" and arguments.state_pose_errors
     refined = free or source == "robot_corrected"
@@ -112,13 +112,13 @@ class _ImagesToRegister:
     """The images that are registered.
 
     Attributes:
-        images: N photographs.
-        poses: (N, 4, 4) of the cameras, in the frame of each image's group.
-        groups: of each image; images of one group share a frame.
-        camera: at the size of the images.
-        outlines: of each image.
-        located: whether the poses come from the spheres that are registered.
-        left_out: those that contradict the others, and why; they have no pose.
+        images: the N photographs.
+        poses: (N, 4, 4) poses of the cameras, in the frame of each image's group.
+        groups: the group of each image; images of one group share a frame.
+        camera: the camera at the size of the images.
+        outlines: the outlines of each image.
+        located: true if the poses come from the spheres that are registered.
+        left_out: the images, by index, that contradict the others, and why; they have no pose.
     """
 
     images: Sequence[PosedPhotograph]
@@ -134,11 +134,11 @@ class _ImagesToRegister:
         return [image.viewpoint for image in self.images]
 
     def posed(self, *, metric: bool) -> PosedImages:
-        """The images as a registration takes them."""
+        """Return the images as a registration takes them."""
         return PosedImages(self.poses, self.camera, groups=self.groups, metric=metric, names=self.names)
 
     def locatable(self, spheres: ScanSpheres) -> _ImagesToRegister:
-        """Those that show four of the spheres, by which a camera can be located."""
+        """Return the images that show four of the spheres, by which a camera can be located."""
         shown = identify(self.outlines, self.posed(metric=True), spheres)
         kept = [i for i, assigned in enumerate(shown) if len(assigned.markers) >= _LEAST_SPHERES]
         return replace(
@@ -150,12 +150,12 @@ class _ImagesToRegister:
         )
 
     def known(self, T_scan_camera: Array) -> dict[str, Transform]:
-        """The poses that are known, by image."""
+        """Return the poses that are known, by image."""
         pairs = enumerate(zip(self.names, T_scan_camera, strict=True))
         return {name: T for i, (name, T) in pairs if i not in self.left_out and np.isfinite(T).all()}
 
     def station(self, group: int) -> str:
-        """The station whose images form a group."""
+        """Return the station whose images form a group."""
         return next(image.station for image, g in zip(self.images, self.groups, strict=True) if g == group)
 
 
@@ -181,7 +181,7 @@ def _posed_images(context: JobContext[job.Arguments]) -> _ImagesToRegister:
 
 
 def _located_images(context: JobContext[job.Arguments], camera: CameraModel) -> _ImagesToRegister:
-    """The images whose spheres determine their poses; of an arm whose mount is unknown, or of a turntable."""
+    """Return the images whose spheres determine their poses; of an arm whose mount is unknown, or of a turntable."""
     arguments = context.arguments
     searched = read_outlines(context.input_json, arguments.outlines, arguments.images, camera)
     spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m)
@@ -203,11 +203,11 @@ class _Placed:
 
     Attributes:
         T_world_scan: the registration.
-        T_world_station: by station.
-        T_scan_camera: by image.
-        components: (6, 6) each, of the covariance of T_world_scan.
-        given: (T_scan_camera by image, (6, 6) covariance) before the outlines refined the arm's corrected poses;
-            None for other poses.
+        T_world_station: the station's pose, by station.
+        T_scan_camera: the camera's pose, by image.
+        components: the parts, (6, 6) each, of the covariance of T_world_scan.
+        given: T_scan_camera by image and the covariance (6, 6) before the outlines refined the arm's corrected
+            poses; None for other poses.
     """
 
     T_world_scan: Transform
@@ -223,7 +223,7 @@ def _placed(
     answer: RegistrationResult,
     placing: RegistrationResult,
 ) -> _Placed:
-    """The scan as `answer` has it, and the cameras as `placing` has them."""
+    """Return the scan as `answer` has it, and the cameras as `placing` has them."""
     arguments = context.arguments
     stated = answer
     if arguments.tracks is not None:
@@ -235,7 +235,7 @@ def _placed(
         images.known(answer.T_scan_camera),
         {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in stated.components.items()},
     )
-    if placing is not answer:  # the outlines of each image alone tell where its camera was
+    if placing is not answer:  # the outlines of each image alone show where its camera was
         return replace(
             placed,
             T_scan_camera=images.known(placing.T_scan_camera_refined),
@@ -307,7 +307,7 @@ def _record(
 def _with_contradictions(
     record: job.Registration, images: _ImagesToRegister, solved: PipelineResult
 ) -> job.Registration:
-    """The record with what contradicts in the inputs."""
+    """Return the record with what contradicts in the inputs."""
     beyond = solved.beyond
     found: dict[str, object] = {
         "findings": tuple(job.Contradiction(**asdict(one)) for one in solved.findings),
@@ -320,7 +320,7 @@ def _with_contradictions(
 
 
 def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> job.LeaveOneOut | None:
-    """Errors of each sphere predicted from the others; None if a station sees too few spheres for that."""
+    """Return the errors of each sphere predicted from the others; None if a station sees too few spheres for it."""
     try:
         left_out = leave_one_out(answer, refined=refined)
     except ComputeError:

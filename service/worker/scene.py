@@ -25,14 +25,14 @@ _A = TypeVar("_A", bound=LiveArguments | HeldArguments)
 
 @dataclass(frozen=True, slots=True)
 class CaptureScene:
-    """What the images of a capture are judged by.
+    """The camera, spheres and surface by which the images of a capture are judged.
 
     Attributes:
-        camera: calibrated or, for images of the board, nominal.
+        camera: the calibrated camera or, for images of the board, the nominal one.
         spheres_m: (S, 3) centres, frame of the scene.
-        radius_m: of the spheres.
-        limits: when a view counts for a point of the surface.
-        surface: of the specimen; None without a CT, and until it is computed.
+        radius_m: the spheres' radius.
+        limits: the conditions on which a view counts for a point of the surface.
+        surface: the specimen's surface; None without a CT, and until it is computed.
     """
 
     camera: CameraModel
@@ -47,20 +47,20 @@ class CaptureScene:
         return 0 if self.surface is None else len(self.surface.points_m)
 
     def seen_from(self, T_scene_camera: Transform | None) -> NDArray[np.bool_]:
-        """(P,) Which points of the surface a view shows; none where its pose is not known."""
+        """Return the mask (P,) of the surface's points that a view shows; none where its pose is not known."""
         if self.surface is None or T_scene_camera is None:
             return np.zeros(self.n_points, dtype=bool)
         return seen(self.surface, T_scene_camera[:3, 3], self.limits, T_scene_camera, self.camera)
 
     def targets_m(self) -> Array:
-        """(T, 3) Points at which the registration's error is predicted: some 200 of the surface, or the spheres."""
+        """Return the points (T, 3) at which the registration's error is predicted: some 200, or the spheres."""
         if self.surface is None:
             return self.spheres_m
         return self.surface.points_m[:: max(1, self.n_points // 200)]
 
 
 def live_scene(context: JobContext[_L]) -> CaptureScene:
-    """The scene of a job on the images of a capture by the robot."""
+    """Return the scene of a job on the images of a capture by the robot."""
     arguments = context.arguments
     return CaptureScene(
         camera_of(arguments.camera),
@@ -72,18 +72,18 @@ def live_scene(context: JobContext[_L]) -> CaptureScene:
 
 
 def kept_surface(context: JobContext[_A]) -> CoverageSurface | None:
-    """The specimen's surface from the file of the job `coverage_points`; None without such a file."""
+    """Return the specimen's surface from the file of the job `coverage_points`; None without such a file."""
     sha256 = context.arguments.surface
     return None if sha256 is None else _surface_in(context.input(sha256))
 
 
 @lru_cache(maxsize=1)
 def _surface_in(artefact: Path) -> CoverageSurface:
-    """The surface in an artefact, whose file never changes, with its tree of rays, which takes long to build."""
+    """Return the surface in an artefact, whose file never changes, with its tree of rays, slow to build."""
     with np.load(artefact, allow_pickle=False) as arrays:
         return CoverageSurface(**{name: arrays[name] for name in arrays.files})
 
 
 def limits_of(record: Limits) -> CoverageLimits:
-    """The limits of a job's record."""
+    """Return the limits of a job's record."""
     return CoverageLimits(record.max_angle_deg, record.max_distance_m, record.min_views)

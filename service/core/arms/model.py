@@ -24,11 +24,11 @@ class Link:
     """A capsule around a part of the arm: all points within `radius_m` of a segment fixed to one of the DH frames.
 
     Attributes:
-        name: of the part, as technicians know it.
-        frame: 0 is the base, k the frame after joint k.
+        name: the part's name, as technicians know it.
+        frame: the frame's number: 0 is the base, k the frame after joint k.
         start_m: (3,) one end of the segment in that frame.
         end_m: (3,) the other end.
-        radius_m: of the capsule.
+        radius_m: the capsule's radius.
     """
 
     name: str
@@ -43,14 +43,14 @@ class ArmTolerances:
     """Usual errors of an arm's geometry, one standard deviation; a calibration estimates a scale of each kind.
 
     Attributes:
-        dh: of a, d (metres), α, θ (radians) of each joint.
-        lengths_m: of a and d, joint by joint; empty: those of `dh` for all.
-        twists_rad: of α, joint by joint; empty: that of `dh` for all.
-        parallel_rad: of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
-        weight: of how many parameters their common scale is known to be about 1, because they were measured on such
-            arms; 0: they are assumed, and the images alone tell the scale.
+        dh: standard deviations of each joint's a, d (metres), α and θ (radians).
+        lengths_m: those of a and d, joint by joint; empty: those of `dh` for all joints.
+        twists_rad: that of α, joint by joint; empty: that of `dh` for all joints.
+        parallel_rad: that of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
+        weight: the number of parameters whose measurement on such arms says that their common scale is about 1; 0:
+            they are assumed, and the scale is estimated from the images alone.
         gear_rad: amplitude of each harmonic of a gear's error.
-        harmonics: periods per revolution that are estimated are 1 … this number.
+        harmonics: the estimated numbers of periods per revolution are 1 … this one.
     """
 
     dh: tuple[float, float, float, float] = (0.2e-3, 0.2e-3, float(np.radians(0.015)), float(np.radians(0.04)))
@@ -59,7 +59,7 @@ class ArmTolerances:
     parallel_rad: float = float(np.radians(0.015))
     weight: float = 0.0
     gear_rad: float = float(np.radians(0.01))
-    harmonics: int = 10  # tens of poses cannot tell faster ones from noise
+    harmonics: int = 10  # tens of poses cannot distinguish faster ones from noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,21 +69,21 @@ class ArmModel:
     T_(i-1)_i = Rz(θ_i) Tz(d_i) Tx(a_i) Rx(α_i).
 
     Attributes:
-        name: the manufacturer's, as the controller states it.
-        family: which closed form solves it.
+        name: the manufacturer's name for it, as the controller gives it.
+        family: the closed form that solves it.
         a_m: (N,) link lengths.
         d_m: (N,) link offsets.
         alpha_rad: (N,) link twists.
         limits_rad: (N,) largest absolute angle of each joint.
         speeds_rad_s: (N,) largest speed of each joint.
-        acceleration_rad_s2: largest that its controller takes for a joint motion.
-        braking_rad_s2: with which the controller brakes the fastest joint when it ends a motion by itself.
+        acceleration_rad_s2: the largest that its controller accepts for a joint motion.
+        braking_rad_s2: the deceleration of the fastest joint when the controller ends a motion by itself.
         links: capsules from the base to the flange; the camera comes from the rig file.
         allowed: pairs of parts that touch by design, or cannot touch: links, `camera`, `table`, `specimen`,
             `spheres`, `surroundings`; the first of a pair is the one nearer to the base.
         usual_rad: (N,) joints of a posture with the camera above a scene that lies in the direction of the base's x.
         payload_kg: largest load on the flange.
-        tolerances: of its geometry.
+        tolerances: the usual errors of its geometry.
     """
 
     name: str
@@ -116,7 +116,7 @@ class ArmModel:
         return tuple(int(i) for i in np.flatnonzero((np.abs(np.sin(self.alpha_rad)) < _PARALLEL) & (self.a_m != 0)))
 
     def joint_values(self, joints_rad: Array) -> Array:
-        """(K, N, 4) nominal a, d, α, θ for joints (K, N)."""
+        """Return (K, N, 4) nominal a, d, α, θ for joints (K, N)."""
         rest = np.stack([self.a_m, self.d_m, self.alpha_rad], axis=1)
         return np.concatenate(
             [np.broadcast_to(rest, (len(joints_rad), self.axes, 3)), joints_rad[:, :, None]], axis=2
@@ -124,13 +124,13 @@ class ArmModel:
 
 
 #: How far a reported flange may be from the nominal forward kinematics of its joints. A controller computes with the
-#: arm's own factory calibration, which nobody else is told: of the published ones, none differs by 6 mm.
+#: arm's own factory calibration, which is not published: of the published ones, none differs by 6 mm.
 FITS_M = 0.010
 FITS_RAD = math.radians(2.0)
 
 
 def flange_pose(arm: ArmModel, joints_rad: Array) -> Transform:
-    """T_base_flange (4, 4) at joints (N,) with the nominal parameters.
+    """Return T_base_flange (4, 4) at joints (N,) with the nominal parameters.
 
     In plain floats: an arm sends 125 samples a second, and one product of small arrays costs as much as all this.
     """
@@ -152,7 +152,7 @@ def flange_pose(arm: ArmModel, joints_rad: Array) -> Transform:
 
 
 def pose_gap(T_a: Transform, T_b: Transform) -> tuple[float, float]:
-    """Distance (m) and angle (rad) between two poses (4, 4)."""
+    """Return the distance (m) and the angle (rad) between two poses (4, 4)."""
     turn = T_a[:3, :3].T @ T_b[:3, :3]
     w = (turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
     angle_rad = math.atan2(math.hypot(*w), float(np.trace(turn)) - 1.0)
@@ -160,7 +160,7 @@ def pose_gap(T_a: Transform, T_b: Transform) -> tuple[float, float]:
 
 
 def fits(gap: tuple[float, float]) -> bool:
-    """Whether a flange that is reported so far (m, rad) from where its joints put it may be there all the same."""
+    """Return whether a flange may be where it is reported, this far (m, rad) from where its joints put it."""
     return gap[0] <= FITS_M and gap[1] <= FITS_RAD
 
 
@@ -169,7 +169,7 @@ GROUP = "orthocapture.arms"
 
 @cache
 def known_arms() -> tuple[ArmModel, ...]:
-    """All arms, ordered by name of their entry points."""
+    """Return all arms, ordered by name of their entry points."""
     found: list[ArmModel] = []
     for point in plug_ins(GROUP):
         arm: object = point.load()
@@ -184,7 +184,7 @@ def known_arms() -> tuple[ArmModel, ...]:
 
 
 def arm_model(name: str) -> ArmModel:
-    """The arm of this name, in upper or lower case.
+    """Return the arm of this name, in upper or lower case.
 
     Raises:
         ConfigurationError: the name is unknown.
@@ -199,5 +199,5 @@ def arm_model(name: str) -> ArmModel:
 
 
 def known_arm(name: str) -> ArmModel | None:
-    """The arm of this name, or None if it is not known."""
+    """Return the arm of this name, or None if it is not known."""
     return next((arm for arm in known_arms() if arm.name.lower() == name.lower()), None)

@@ -16,7 +16,7 @@ _ROUNDING_S = 1e-9
 def motion_problems(
     motion: Motion, arms: Sequence[ArmModel], abandoned: Abandoned | None
 ) -> Iterator[tuple[str, str]]:
-    """Yield the fields of a protocol's motion that are too large, with words that say for what.
+    """Yield the fields of a protocol's motion that are too large, with a text that says for what.
 
     Args:
         motion: the protocol's section; its speed and acceleration are those of the fastest joint, whichever that is.

@@ -20,7 +20,7 @@ _BENDS = (1, 3, 5)  # shoulder, elbow and wrist: where one is straight, the arm 
 
 
 def postures(arm: ArmModel, T_base_flange: Transform, elbow_angles_rad: Array | None = None) -> Array:
-    """Joints (K, 7) within the limits that reach a pose, for elbow angles all round; empty if out of reach.
+    """Return joints (K, 7) within limits that reach a pose, for elbow angles all round; empty if out of reach.
 
     The elbow angle turns the elbow about the line from the shoulder to the wrist; it is 0 where joint 3 is. For each
     one there are up to eight postures: elbow, shoulder and wrist either way round.
@@ -50,7 +50,7 @@ def postures(arm: ArmModel, T_base_flange: Transform, elbow_angles_rad: Array | 
 
 
 def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
-    """Joints (7,) that reach a pose and are near `near_rad`, clear of limits and singularities; None if out of reach.
+    """Return joints (7,) that reach a pose near `near_rad`, clear of limits and singularities; None if out of reach.
 
     The elbow angle is the one at `near_rad` unless another brings less motion, or more room.
     """
@@ -59,14 +59,14 @@ def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) ->
 
 
 def postures_by_cost(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
-    """Joints (K, 7) that reach a pose with the elbow at `near_rad`'s angle and all round, the best ones first."""
+    """Return joints (K, 7) that reach a pose with the elbow at `near_rad`'s angle and all round, the best first."""
     angles = np.concatenate([[elbow_angle_rad(arm, near_rad)], np.linspace(-np.pi, np.pi, _ELBOWS, endpoint=False)])
     found = postures(arm, T_base_flange, angles)
     return found[np.argsort(posture_costs(arm, found, near_rad), kind="stable")]
 
 
 def posture_costs(arm: ArmModel, joints_rad: Array, near_rad: Array) -> Array:
-    """(K,) squared travel (rad²) from `near_rad` to joints (K, 7), plus what limits and singularities cost.
+    """Return (K,) squared travel (rad²) from `near_rad` to joints (K, 7), plus what limits and singularities cost.
 
     A joint close to its limit costs, and so does a shoulder, elbow or wrist that is nearly straight.
     """
@@ -85,7 +85,7 @@ def _singular_costs(joints_rad: Array, near_rad: Array) -> Array:
 
 
 def elbow_angle_rad(arm: ArmModel, joints_rad: Array) -> float:
-    """The elbow angle at joints (7,), -π … π."""
+    """Return the elbow angle at joints (7,), -π … π."""
     base, _, _, hand = arm.d_m[::2]
     T = flange_pose(arm, joints_rad)
     wrist = T[:3, 3] - hand * T[:3, 2] - np.array([0.0, 0.0, base])
@@ -99,7 +99,7 @@ def elbow_angle_rad(arm: ArmModel, joints_rad: Array) -> float:
 
 
 def _reference(arm: ArmModel, wrist: Array, q4: float) -> Array:
-    """Rotation (3, 3) of the upper arm that brings the wrist to this place (from the shoulder) with joint 3 at 0."""
+    """Return the rotation (3, 3) of the upper arm that brings the wrist here (from the shoulder), joint 3 at 0."""
     _, upper, fore, _ = arm.d_m[::2]
     leaning = np.arctan2(np.hypot(wrist[0], wrist[1]), wrist[2])
     q2 = leaning + np.arctan2(fore * np.sin(q4), upper + fore * np.cos(q4))
@@ -107,7 +107,7 @@ def _reference(arm: ArmModel, wrist: Array, q4: float) -> Array:
 
 
 def _zyz(R: Array, side: int) -> Array:
-    """(K, 3) angles with R = Rz Ry Rz, the middle one of this sign; where it is 0 the first is 0."""
+    """Return (K, 3) angles with R = Rz Ry Rz, the middle one of this sign; where it is 0 the first is 0."""
     sine = side * np.hypot(R[:, 0, 2], R[:, 1, 2])
     middle = np.arctan2(sine, R[:, 2, 2])
     first = np.arctan2(side * R[:, 1, 2], side * R[:, 0, 2])
@@ -119,7 +119,7 @@ def _zyz(R: Array, side: int) -> Array:
 
 
 def _about(axis: Array, angles: Array) -> Array:
-    """(K, 3, 3) rotations about a unit axis (3,), by Rodrigues' formula."""
+    """Return (K, 3, 3) rotations about a unit axis (3,), by Rodrigues' formula."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + np.sin(angles)[:, None, None] * K + (1.0 - np.cos(angles))[:, None, None] * (K @ K)

@@ -1,4 +1,4 @@
-"""Accepting a measure outside its limits: who may, who may not, the words for it, and which steps depend on it."""
+"""Accepting a measure outside its limits: who may, who may not, the text for it, and which steps depend on it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ROLE_OF: Mapping[AcceptedBy, str] = {"supervisor": "supervisor", "another_superv
 
 
 def failed_gates(step: StepState) -> tuple[GateVerdict, ...]:
-    """The verdicts of a step that did not pass: outside the limits, undecided or not measured."""
+    """Return the verdicts of a step that did not pass: outside the limits, undecided or not measured."""
     return tuple(verdict for verdict in step.verdicts if not verdict.passed)
 
 
 def acceptors(protocol: Protocol, state: RunState) -> frozenset[AcceptedBy]:
-    """Who may accept the failed gates of the current step by the protocol; empty when none failed."""
+    """Return who may accept the failed gates of the current step by the protocol; empty when none failed."""
     by: dict[str, AcceptedBy | None] = {g.measure: g.accept_by for g in protocol.step(state.current).gates}
     found: set[AcceptedBy] = set()
     for verdict in failed_gates(state.step):
@@ -33,13 +33,13 @@ def acceptors(protocol: Protocol, state: RunState) -> frozenset[AcceptedBy]:
 
 
 def demanded_role(protocol: Protocol, state: RunState) -> str:
-    """The role that may accept the figures of the current step; "" when nobody may."""
+    """Return the role that may accept the figures of the current step; "" when nobody may."""
     roles = sorted({ROLE_OF[by] for by in acceptors(protocol, state)})
     return roles[0] if roles and acceptance_refusal(protocol, state) is None else ""
 
 
 def acceptance_refusal(protocol: Protocol, state: RunState) -> IllegalTransitionError | None:
-    """The reason why nobody at all may accept the figures of the current step, or None."""
+    """Return the reason why nobody at all may accept the figures of the current step, or None."""
     step, now = protocol.step(state.current), state.step
     failed = failed_gates(now)
     if state.phase != "recovering" or now.failure is not None or not failed:
@@ -67,7 +67,7 @@ def acceptance_refusal(protocol: Protocol, state: RunState) -> IllegalTransition
 def acceptor_refusal(
     protocol: Protocol, state: RunState, action: OperatorAction, actor: str
 ) -> IllegalTransitionError | None:
-    """The reason why this person may not accept the figures of the current step, or None."""
+    """Return the reason why this person may not accept the figures of the current step, or None."""
     if action.automatic or action.via in ("pedal", "auto"):
         return IllegalTransitionError(
             "only a person may accept figures outside their limits, by a signature", where=state.current
@@ -90,7 +90,7 @@ def acceptor_refusal(
 
 
 def describe_accepted(accepted: AcceptedDeviation) -> str:
-    """One line on an acceptance: `coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the reason`."""
+    """Describe an acceptance: `coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the reason`."""
     figures = "; ".join(describe_judged(verdict) for verdict in accepted.verdicts)
     how = {"claimed": ", by claim", "pin": ", by PIN", "badge": ", by badge"}.get(accepted.identified, "")
     return f"{figures}; accepted by {accepted.by} ({accepted.role}{how}): {accepted.reason}"
@@ -111,19 +111,19 @@ class AcceptedGate:
 
 
 def used_steps(protocol: Protocol, step: Step) -> frozenset[str]:
-    """The earlier steps that a step's params name directly."""
+    """Return the earlier steps that a step's params name directly."""
     earlier = frozenset(protocol.step_ids[: protocol.index(step.id)])
     return earlier.intersection(_texts(step.params.model_dump(mode="json")))
 
 
 def accepted_gates(protocol: Protocol, state: RunState) -> tuple[AcceptedGate, ...]:
-    """Every acceptance in force in a run, in the protocol's order."""
+    """Return every acceptance in force in a run, in the protocol's order."""
     found = ((step, state.steps[step.id].accepted) for step in protocol.steps)
     return tuple(AcceptedGate(step.id, step.title, accepted) for step, accepted in found if accepted is not None)
 
 
 def depends_on(protocol: Protocol, state: RunState, step_id: str) -> tuple[AcceptedGate, ...]:
-    """The acceptances that a step's result depends on: its own and, transitively, those of the steps it uses."""
+    """Return the acceptances that a step's result depends on: its own and, transitively, those of steps it uses."""
     reached: set[str] = set()
     waiting = [step_id]
     while waiting:
@@ -135,7 +135,7 @@ def depends_on(protocol: Protocol, state: RunState, step_id: str) -> tuple[Accep
 
 
 def dependent_steps(protocol: Protocol, step_id: str) -> tuple[str, ...]:
-    """The later steps that depend on this one, directly or not, in the protocol's order."""
+    """Return the later steps that depend on this one, directly or not, in the protocol's order."""
     rests = {step_id}
     for step in protocol.steps[protocol.index(step_id) + 1 :]:
         if used_steps(protocol, step) & rests:

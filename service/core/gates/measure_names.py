@@ -67,7 +67,7 @@ MEASURE_NAMES: Mapping[str, str] = {
     "checklist_items_ticked": "Checklist items ticked",
     "applications": "Applications of the coat",
     "since_application_min": "Age of the coat at the scan",
-    # spheres, and how well they can be told apart
+    # spheres, and how well they can be distinguished
     "spheres_seen": "Spheres seen",
     "spheres_found": "Spheres found",
     "layout_margin_mm": "Margin against confusing four spheres",
@@ -186,7 +186,7 @@ _ACRONYMS: Mapping[str, str] = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "g
 def measure_name(measure: str) -> str:
     """Return the name of a measure for people: `Mean radial error (COLMAP poses)` for colmap_mean_radial_error_mm.
 
-    A measure that a plug-in declares is named by its identifier in words, without the unit.
+    A measure that a plug-in declares is named by its identifier with spaces, without the unit.
     """
     if measure in MEASURE_NAMES:
         return MEASURE_NAMES[measure]

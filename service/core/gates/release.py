@@ -12,11 +12,11 @@ from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.core.text.words import counted
 
-_NAMED = 20  # deviations that the words of a release name; the record has the others
+_NAMED = 20  # deviations that the text of a release names; the record has the others
 
 
 def release_meaning(state: RunState) -> str:
-    """What a person states who releases the run: that they read it, and with which deviations."""
+    """Return what a person declares who releases the run: that they read it, and with which deviations."""
     texts = [f"{one.kind.replace('_', ' ')}, {' '.join(one.text.split()).rstrip('.')}" for one in state.deviations]
     if not texts:
         return "I have read this run, in which nothing deviated from the protocol, and release it"
@@ -26,12 +26,12 @@ def release_meaning(state: RunState) -> str:
 
 
 def loses_release(protocol: Protocol, state: RunState, actor: str) -> bool:
-    """Whether a person who acts on the run now can no longer release it as the second person."""
+    """Return whether a person who acts on the run now can no longer release it as the second person."""
     return protocol.release == "second_person" and not state.released_by and actor not in state.people
 
 
 def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTransitionError | None:
-    """The reason why this person cannot release the run by signing this hash, or None."""
+    """Return the reason why this person cannot release the run by signing this hash, or None."""
     if state.status != "completed":
         return IllegalTransitionError(
             f"the run is {state.status}", where="release", remedy="Only a completed run can be released"
@@ -52,7 +52,7 @@ def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTr
 
 
 def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError | None:
-    """The reason why the run may not be exported yet, for want of a release, or None."""
+    """Return the reason why the run may not be exported yet, for want of a release, or None."""
     if protocol.release == "second_person" and not state.released_by:
         return IllegalTransitionError(
             "the protocol asks for a second person's release before anything is exported",
@@ -64,7 +64,7 @@ def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError
 
 
 def refuse_data_set(state: RunState) -> IllegalTransitionError | None:
-    """The reason why there is no data set of the run yet, or None."""
+    """Return the reason why there is no data set of the run yet, or None."""
     if state.status != "completed":
         return IllegalTransitionError(
             f"the run is {state.status}", where=state.run_id, remedy="Only a completed run is exported"
@@ -76,7 +76,7 @@ _ANSWERS = ("registrations", "accuracy")  # what must be known before a specimen
 
 
 def freed_utc(protocol: Protocol, state: RunState) -> str:
-    """When the specimen was freed, so that nothing can be measured again (ISO 8601, UTC); "" before that.
+    """Return when the specimen was freed, so that nothing can be measured again (ISO 8601, UTC); "" before that.
 
     That is when the first irreversible step that requires a registration or an evaluation passed, or else the end of
     the run.
@@ -85,7 +85,7 @@ def freed_utc(protocol: Protocol, state: RunState) -> str:
 
 
 def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
-    """Seconds from `freed_utc` to a result that arrives at `now_utc`; None if it is in time."""
+    """Return the seconds from `freed_utc` to a result that arrives at `now_utc`; None if it is in time."""
     freed = freed_utc(protocol, state)
     if not freed:
         return None
@@ -93,7 +93,7 @@ def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
 
 
 def late_words(protocol: Protocol, state: RunState, seconds: float) -> str:
-    """A delay in words, such as `arrived 12 min after the specimen was freed`."""
+    """Return a delay as text, such as `arrived 12 min after the specimen was freed`."""
     since = "the specimen was freed" if _freed_by_step_utc(protocol, state) else "the end of the run"
     minutes = round(seconds / 60)
     return f"arrived {minutes} min after {since}" if minutes else f"arrived after {since}"

@@ -33,10 +33,10 @@ def evaluate_gates(
     Args:
         step: the step with its gates.
         attempt: the attempt that measured.
-        measures: measure → value, in the unit of its gate.
+        measures: the value of each measure, in the unit of its gate.
         skipped: identifiers of skipped steps. A gate that names one in `unless_skipped` is not judged, because the
             number does not exist without that step. The skip and its reason are in the record.
-        uncertainties: measure → uncertainty, where one is known.
+        uncertainties: the uncertainty of each measure, where one is known.
     """
     gates = [gate for gate in step.gates if gate.unless_skipped is None or gate.unless_skipped not in skipped]
     verdicts = judge(gates, measures, uncertainties)
@@ -78,7 +78,7 @@ Standing = Literal["within", "not_decided", "accepted", "outside"]
 
 
 def standing(verdict: GateVerdict, *, accepted: bool = False) -> Standing:
-    """The outcome of a gate; `accepted` says that a person let the step pass with its figures as they are."""
+    """Return the outcome of a gate; `accepted` says that a person let the step pass with its figures as they are."""
     if verdict.passed:
         return "within"
     if accepted:
@@ -94,25 +94,25 @@ def describe(verdict: GateVerdict) -> str:
 
 
 def describe_judged(verdict: GateVerdict) -> str:
-    """`describe`, with `: not decided` after an undecided verdict, for a line that stands alone."""
+    """Return `describe`, with `: not decided` after an undecided verdict, for a line that stands alone."""
     return describe(verdict) + (": not decided" if verdict.undecided else "")
 
 
 def figure(verdict: GateVerdict) -> str:
-    """A verdict's value: `0.71 px`, or with its 99 % bounds `0.52 mm, 0.41 to 0.63` (see BOUNDS_HOLD)."""
+    """Return a verdict's value: `0.71 px`, or with its 99 % bounds `0.52 mm, 0.41 to 0.63` (see BOUNDS_HOLD)."""
     if verdict.value is None or verdict.lower is None or verdict.upper is None:
         return quantity(verdict.value, verdict.unit)
     return uncertain(verdict.value, verdict.lower, verdict.upper, verdict.unit)
 
 
 def uncertain(value: float, lower: float, upper: float, unit: str = "") -> str:
-    """A value with its bounds, `0.52 mm, 0.41 to 0.63`, with enough decimal places to tell the bounds apart."""
+    """Return a value with its bounds, `0.52 mm, 0.41 to 0.63`, and enough decimal places to distinguish them."""
     places = _places(upper - lower)
     return f"{value:.{places}f} {unit}".rstrip() + f", {lower:.{places}f} to {upper:.{places}f}"
 
 
 def quantity(value: float | None, unit: str = "") -> str:
-    """A number with its unit, for people: `8 images`, `1 image`, `0.71 px`; `not measured` for None."""
+    """Return a number with its unit, for people: `8 images`, `1 image`, `0.71 px`; `not measured` for None."""
     if value is None:
         return "not measured"
     if value == 1 and unit.endswith("s") and unit not in _UNITS_IN_S:
@@ -126,7 +126,7 @@ def _places(apart: float) -> int:
 
 
 def limits(minimum: float | None, maximum: float | None) -> str:
-    """Return limits in words: `≥ 0.2 and ≤ 1`, or `exactly 0`; None means no limit on that side."""
+    """Return limits as text: `≥ 0.2 and ≤ 1`, or `exactly 0`; None means no limit on that side."""
     if minimum is not None and minimum == maximum:
         return f"exactly {minimum:g}"
     low = "" if minimum is None else f"≥ {minimum:g}"

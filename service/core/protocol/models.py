@@ -68,7 +68,7 @@ class Reasons(Record):
 
 
 def full_reason(preset: str, own: str) -> str:
-    """The reason that is recorded: the chosen preset, then the operator's own words."""
+    """Return the reason that is recorded: the chosen preset, then the operator's own text."""
     return ": ".join(part for part in (preset.strip(), own.strip()) if part)
 
 
@@ -114,9 +114,9 @@ Exposure = Annotated[
 class Spheres(Record):
     """The reference spheres on and around the specimen."""
 
-    radius_mm: Positive  # of each sphere
-    registration: Annotated[int, Field(ge=4)]  # how many
-    control: Annotated[int, Field(ge=0)] = 0  # how many control spheres; they take no part in the registration
+    radius_mm: Positive  # the radius of each sphere
+    registration: Annotated[int, Field(ge=4)]  # the number of registration spheres
+    control: Annotated[int, Field(ge=0)] = 0  # the number of control spheres; they take no part in the registration
     # If it is not given, the detector learns it from the clearest spheres of each image.
     colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
 
@@ -127,9 +127,9 @@ class CalibrationBoard(Record):
     columns: Annotated[int, Field(ge=3)]  # inner corners in a row
     rows: Annotated[int, Field(ge=3)]  # inner corners in a column
     square_mm: Positive  # side of a square
-    # Largest bow of the board, as the maker states it; 0: exactly flat; default: 0.2.
+    # Largest bow of the board, as the maker gives it; 0: exactly flat; default: 0.2.
     flatness_mm: Annotated[float, Field(ge=0, le=5)] | None = None
-    # Largest error of the square's side, in percent of it, as the maker states it; default: 0.05 (0.1 mm in 200 mm).
+    # Largest error of the square's side, in percent of it, as the maker gives it; default: 0.05 (0.1 mm in 200 mm).
     size_tolerance_percent: Annotated[float, Field(ge=0, le=20)] | None = None
 
 
@@ -139,22 +139,22 @@ class CameraSection(Record):
     aperture_f: Positive  # f-number
     exposure_s: Exposure  # seconds, or a fraction such as 1/15
     iso: Annotated[int, Field(gt=0)]  # sensitivity
-    focus_mode: Text = "Manual"  # as the camera names it
-    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"  # what the camera writes
+    focus_mode: Text = "Manual"  # the camera's name for it
+    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"  # the files that the camera writes
 
 
 class Motion(Record):
-    """How the arm moves between viewpoints."""
+    """The arm's motion between viewpoints."""
 
-    speed_rad_s: Positive = 0.5  # of the fastest joint
-    acceleration_rad_s2: Positive = 0.5  # of the fastest joint
+    speed_rad_s: Positive = 0.5  # the speed of the fastest joint
+    acceleration_rad_s2: Positive = 0.5  # the acceleration of the fastest joint
     dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # between standing still and the exposure
     # How long a confirmation lets the arm set out without visible progress; then it is asked for again.
     confirmed_for_s: Positive = 60.0
 
 
 class Settle(Record):
-    """When the arm counts as standing still, and how long to wait for it."""
+    """The conditions on which the arm counts as standing still, and the longest wait for them."""
 
     window_s: Positive = 0.5  # over which all limits must hold
     joint_speed_rad_s: Positive = 0.001  # largest of any joint
@@ -174,14 +174,14 @@ class Gate(Record):
     measure: Text  # name of a number that the step measures
     min: Finite | None = None  # smallest value that passes
     max: Finite | None = None  # largest value that passes
-    unit: str = ""  # of the limits; checked against the unit of the measure
+    unit: str = ""  # the unit of the limits; checked against the unit of the measure
     why: str = ""  # the reason for the limit, for people
     unless_skipped: str | None = None  # the earlier step that the number needs: if it is skipped, there is no gate
     accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates.acceptance
 
 
 class Recovery(Record):
-    """What happens when the work of a step fails (service.core.recovery)."""
+    """The response to failed work of a step (service.core.recovery)."""
 
     retries: Annotated[int, Field(ge=0, le=20)] = 2  # after transient device errors without progress in between
     wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
@@ -190,35 +190,35 @@ class Recovery(Record):
 
 
 class HandAction(Record):
-    """What the technician does by hand when confirming this step; a simulated rig does it by itself."""
+    """The technician's work by hand when confirming this step; a simulated rig does it by itself."""
 
-    action: Text  # what the simulator is asked to do
+    action: Text  # the action that the simulator is asked for
     station: str | None = None  # where
-    device: str | None = None  # with which device of the rig
+    device: str | None = None  # the rig's device that is used
 
 
 class StepFields(Record):
     """The fields of a step other than its params."""
 
     id: StepId  # name in the record, unique in the protocol
-    kind: Text  # what the step does: one of the step kinds
-    title: Text  # what people read
+    kind: Text  # the work of the step: one of the step kinds
+    title: Text  # the title that people read
     why: str = ""  # the reason, for the technician
-    instructions: str = ""  # what the technician should do
+    instructions: str = ""  # the technician's work, as text
     # In service/web/run/drawings, shown beside the instructions; "": that of the step kind. A checklist with `camera`
     # offers the live view, because the lens is focused there.
     drawing: str = ""
     checklist: tuple[Text, ...] = ()  # items to tick before the step can be confirmed
     gates: tuple[Gate, ...] = ()  # measured numbers with their limits
-    sign: bool = False  # whether a person signs before the step passes
-    confirm: bool = True  # whether a person starts it; a step that moves the robot always waits for one
-    skippable: bool = False  # whether a person may skip it, with a reason
-    irreversible: bool = False  # whether nothing before it can be done again afterwards
-    cannot_be_undone: str = ""  # what a person reads before an irreversible step: a sentence
+    sign: bool = False  # true if a person signs before the step passes
+    confirm: bool = True  # true if a person starts it; a step that moves the robot always waits for one
+    skippable: bool = False  # true if a person may skip it, with a reason
+    irreversible: bool = False  # true if nothing before it can be done again afterwards
+    cannot_be_undone: str = ""  # the sentence that a person reads before an irreversible step
     requires: tuple[str, ...] = ()  # earlier steps that must not have been skipped
     # How long the work usually takes, in seconds; used until this site has measured it. None: not known.
     takes_s: Positive | None = None
-    recovery: Recovery = Recovery()  # what happens when the work fails
+    recovery: Recovery = Recovery()  # the response to failed work
     simulated_hands: tuple[HandAction, ...] = ()  # ignored on a real rig
 
 
@@ -229,41 +229,41 @@ class Step(StepFields):
 
     @property
     def moves_robot(self) -> bool:
-        """Whether the robot moves during this step; confirming it takes a held button or two pedal presses."""
+        """True if the robot moves during this step; confirming it takes a held button or two pedal presses."""
         return self.params.moves_robot
 
     @property
     def repeated(self) -> RepeatedStep:
-        """What trying this step again means."""
+        """The meaning of trying this step again."""
         return self.params.repeated
 
     @property
     def gives(self) -> Gives | None:
-        """What others look for in this step's result."""
+        """The kind of result that other steps look for in this one; None if there is none."""
         return self.params.gives
 
     @property
     def by_hand(self) -> bool:
-        """Whether a person takes this step's images with the camera in the hand."""
+        """True if a person takes this step's images with the camera in the hand."""
         return self.params.by_hand
 
     @property
     def photographs_specimen(self) -> bool:
-        """Whether this step takes images of the specimen."""
+        """True if this step takes images of the specimen."""
         return self.params.photographs_specimen
 
     @property
     def needs_disk(self) -> bool:
-        """Whether this step stores files."""
+        """True if this step stores files."""
         return self.params.needs_disk
 
     @property
     def begins_confirmed(self) -> bool:
-        """Whether a person must let it begin; always so if it moves the robot, whatever the protocol says."""
+        """True if a person must let it begin; always so if it moves the robot, whatever the protocol says."""
         return self.confirm or self.moves_robot
 
     def params_as(self, model: type[ParamsT]) -> ParamsT:
-        """The params, typed. Raises ProtocolError when the step is of another kind."""
+        """Return the params, typed. Raises ProtocolError when the step is of another kind."""
         if not isinstance(self.params, model):
             raise ProtocolError(f"the params of this step are not {model.__qualname__}", where=f"step {self.id}")
         return self.params
@@ -274,17 +274,17 @@ class ProtocolFields(Record):
 
     id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]  # name in the record and on the pages
     version: Text  # changes with the content
-    title: Text  # what people read
-    source: str = ""  # where the procedure comes from
+    title: Text  # the title that people read
+    source: str = ""  # the source of the procedure
     spheres: Spheres  # radius and number of the spheres
     board: CalibrationBoard | None = None  # the calibration board; needed by a step that calibrates
     camera: CameraSection | None = None  # None: no settings are required, and no step sets a camera
     motion: Motion = Motion()  # speed and acceleration of the arm
-    settle: Settle = Settle()  # when the arm counts as standing still
+    settle: Settle = Settle()  # the conditions on which the arm counts as standing still
     # Whether a person who took no part in the run must release it before anything is exported.
     release: Literal["none", "second_person"] = "none"
     reasons: Reasons = Reasons()  # presets for the reason of a redo, a skip or an acceptance
-    data_set: DataSetStatement = DataSetStatement()  # what an exported data set says about itself
+    data_set: DataSetStatement = DataSetStatement()  # the statement of an exported data set about itself
 
 
 class Protocol(ProtocolFields):
@@ -298,11 +298,11 @@ class Protocol(ProtocolFields):
         return tuple(step.id for step in self.steps)
 
     def step(self, step_id: str) -> Step:
-        """The step with this identifier. Raises ProtocolError if there is none."""
+        """Return the step with this identifier. Raises ProtocolError if there is none."""
         return self.steps[self.index(step_id)]
 
     def index(self, step_id: str) -> int:
-        """The step's position. Raises ProtocolError if there is none."""
+        """Return the step's position. Raises ProtocolError if there is none."""
         try:
             return self.step_ids.index(step_id)
         except ValueError:
@@ -348,7 +348,7 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]]
 
     Args:
         content: the file's bytes.
-        params_models: step kind → its Params.
+        params_models: the Params model of each step kind.
         name: the file's name in error messages.
 
     Raises:
@@ -378,7 +378,7 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]]
 def _validate_params(
     data: Mapping[str, Plain], models: Mapping[str, type[StepParams]], tree: YamlTree, problems: list[YamlProblem]
 ) -> dict[int, StepParams]:
-    """The params of every valid step by its index; appends what is wrong with the others to `problems`."""
+    """Return the params of every valid step by its index; appends what is wrong with the others to `problems`."""
     params: dict[int, StepParams] = {}
     steps = data.get("steps")
     for index, step in enumerate(steps if isinstance(steps, list) else []):
@@ -405,7 +405,7 @@ def _refuse(problems: list[YamlProblem], name: str) -> NoReturn:
 
 
 def protocol_json_schema(params_models: Mapping[str, type[StepParams]]) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of a protocol file for editors, with the params of every step kind."""
+    """Return the JSON Schema (draft 2020-12) of a protocol file for editors, with the params of every step kind."""
     kinds: list[type[BaseModel]] = []
     for kind, model in sorted(params_models.items()):
         needed = any(field.is_required() for field in model.model_fields.values())
@@ -423,7 +423,7 @@ def protocol_json_schema(params_models: Mapping[str, type[StepParams]]) -> dict[
 
 
 def irreversible_warning(protocol: Protocol, step: Step) -> str:
-    """Say in plain words what cannot be undone after this step, and what is judged only when it is too late."""
+    """Say what cannot be undone after this step, and what is judged only when it is too late."""
     at = protocol.index(step.id)
     closed = [s.title for s in protocol.steps[:at] if s.photographs_specimen or s.id in step.requires]
     afterwards = [s.title for s in takewhile(lambda s: not s.begins_confirmed, protocol.steps[at + 1 :]) if s.gates]

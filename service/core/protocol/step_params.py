@@ -1,4 +1,4 @@
-"""Params of steps: the bases that tell the core what it must know of a step kind."""
+"""Params of steps: the bases from which the core learns what it must know of a step kind."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from service.core.records.base import Record
 
 @dataclass(frozen=True, slots=True)
 class RepeatedStep:
-    """What trying a kind of step again means after its figures were outside their limits.
+    """The meaning of trying a kind of step again after its figures were outside their limits.
 
     Attributes:
-        words: what to do, and what happens then.
-        same: whether it gives the same figures unless a step it depends on is done again.
-        device: whether a device can fail during the step.
-        computes: whether a computation can fail during the step.
+        words: the advice: what to do, and what happens then.
+        same: true if it gives the same figures unless a step it depends on is done again.
+        device: true if a device can fail during the step.
+        computes: true if a computation can fail during the step.
     """
 
     words: str
@@ -46,11 +46,11 @@ class StepParams(Record):
     """Base of the params of every step kind.
 
     Attributes:
-        gives: what others look for in the result of such a step; None: nothing that others look for.
-        by_hand: whether a person takes its images with the camera in the hand, as many as are needed.
-        only_ticks: whether it is nothing but what people tick.
-        repeated: what trying such a step again means.
-        needs_disk: whether such a step stores files; the others also run when the disk is full.
+        gives: the kind of result that other steps look for in such a step; None: they look for nothing in it.
+        by_hand: true if a person takes its images with the camera in the hand, as many as are needed.
+        only_ticks: true if it is nothing but what people tick.
+        repeated: the meaning of trying such a step again.
+        needs_disk: true if such a step stores files; the others also run when the disk is full.
     """
 
     gives: ClassVar[Gives | None] = None
@@ -61,12 +61,12 @@ class StepParams(Record):
 
     @property
     def moves_robot(self) -> bool:
-        """Whether the robot moves during this step with these params."""
+        """True if the robot moves during this step with these params."""
         return False
 
     @property
     def photographs_specimen(self) -> bool:
-        """Whether this step takes images of the specimen, which nobody can take again once it was changed."""
+        """True if this step takes images of the specimen, which nobody can take again once it was changed."""
         return False
 
     @property
@@ -89,8 +89,8 @@ class NamesStep:
     """Marks a field of params whose value names an earlier step, or several.
 
     Attributes:
-        does: what such a step must do, in words: `imports a scan`.
-        fits: whether a step with these params does.
+        does: the thing such a step must do, as a phrase: `imports a scan`.
+        fits: says if a step with these params does it.
     """
 
     does: str
@@ -98,7 +98,7 @@ class NamesStep:
 
 
 def names_step(does: str, *gives: Gives) -> NamesStep:
-    """The mark of a field that names a step whose result is one of these."""
+    """Return the mark of a field that names a step whose result is one of these."""
     return NamesStep(does, lambda params: params.gives in gives)
 
 
@@ -113,7 +113,7 @@ NAMES_CAPTURE = NamesStep(
 
 
 def named_steps(params: BaseModel) -> Iterator[tuple[tuple[str | int, ...], str, NamesStep]]:
-    """Every step that params name: the place of the name in them, the name, and the mark of its field."""
+    """Yield every step that params name: the place of the name in them, the name, and the mark of its field."""
     for field, info in type(params).model_fields.items():
         value: object = getattr(params, field)
         mark = next((one for one in info.metadata if isinstance(one, NamesStep)), None)

@@ -16,7 +16,7 @@ class Record(BaseModel):
 
 
 def recorded(record: Record) -> dict[str, Any]:
-    """A record as it is written into an event: all of its own fields; of the records in it, the fields that were set.
+    """Return a record as it is written into an event: all of its own fields, and the set fields of records in it.
 
     So a part that was read from an earlier event is written again exactly as it was.
     """
@@ -38,16 +38,16 @@ _AGREE_SHARE = 0.001  # and of the time that has passed: UTC is slewed by up to 
 
 
 def seconds_between(earlier_utc: str, later_utc: str) -> float:
-    """Seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
+    """Return the seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
     return max(0.0, (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds())
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """When something happened, in both clocks of the host.
+    """The time of something that happened, in both clocks of the host.
 
-    The monotonic clock begins anew with each boot and stands still while the host sleeps; UTC can be set. What one
-    of them cannot tell, the other can.
+    The monotonic clock starts again with each boot and stands still while the host sleeps; UTC can be set. Each of
+    them supplies what the other cannot.
     """
 
     monotonic_s: float
@@ -64,12 +64,12 @@ class Elapsed:
 
 
 def elapsed(earlier: Moment, later: Moment) -> Elapsed:
-    """The time from one moment to a later one, which is never negative.
+    """Return the time from one moment to a later one, which is never negative.
 
     Within one boot it is that of the monotonic clock where UTC agrees with it, and that of UTC where more of it has
     passed: the host slept, or its clock was set forward; the longer time is then the safe one. Over a reboot it is
     that of UTC. It is not known if it would be negative, if less UTC than monotonic time has passed (the clock was
-    set back), or if a record lacks what is needed to tell.
+    set back), or if a record does not have what is needed.
     """
     if not earlier.at_utc or not later.at_utc:
         return Elapsed(None, "the record has the time of one boot only, as older versions wrote it")
@@ -86,7 +86,7 @@ def elapsed(earlier: Moment, later: Moment) -> Elapsed:
 
 
 def age_s(since_utc_s: float, now_utc_s: float, *, if_set_back_s: float) -> float:
-    """The time in seconds since a moment that was recorded in UTC alone, which is never negative.
+    """Return the time in seconds since a moment that was recorded in UTC alone, which is never negative.
 
     A moment later than now by more than `elapsed` tolerates shows that the clock was set back, so that its age is not
     known: `if_set_back_s` is then the answer, which the caller chooses on the safe side (infinity ends a sign-in; 0
@@ -97,7 +97,7 @@ def age_s(since_utc_s: float, now_utc_s: float, *, if_set_back_s: float) -> floa
 
 
 def _within_one_boot(utc_s: float, monotonic_s: float) -> Elapsed:
-    """The time where the two clocks disagree within one boot."""
+    """Return the time where the two clocks disagree within one boot."""
     if monotonic_s < 0:
         return Elapsed(None, f"the monotonic clock ran back by {-monotonic_s:.0f} s within one boot")
     if utc_s > monotonic_s:

@@ -47,9 +47,9 @@ class Party:
     """A person or a body.
 
     Attributes:
-        name: as it was given, without the identifier.
-        kind: as schema.org calls it.
-        address: of its ORCID or ROR; "" if none was given.
+        name: the name as it was given, without the identifier.
+        kind: schema.org's name for a person or a body.
+        address: the address of its ORCID or ROR; "" if none was given.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Party:
 
 
 def party(text: str, *, otherwise: Literal["Person", "Organization", ""] = "") -> Party:
-    """A person or body from a line: its name, and an ORCID or a ROR if it has one.
+    """Return a person or body from a line: its name, and an ORCID or a ROR if it has one.
 
     `person: NAME` or `organisation: NAME` says which it is where neither is given and the name does not show it.
     `otherwise` is what it is where nothing says it; "": as the name sounds.
@@ -99,7 +99,7 @@ def _likely(name: str) -> Literal["Person", "Organization"]:
 
 
 def _checked_orcid(text: str) -> str:
-    """The ORCID in groups of four. Raises DataError unless its check digit (ISO 7064, mod 11-2) is right."""
+    """Return the ORCID in groups of four. Raises DataError unless its check digit (ISO 7064, mod 11-2) is right."""
     digits = text.replace("-", "").upper()
     total = 0
     for digit in digits[:-1]:
@@ -113,7 +113,7 @@ def _checked_orcid(text: str) -> str:
 
 
 def _checked_ror(text: str) -> str:
-    """The ROR in lower case. Raises DataError unless form and check digits (ISO 7064, mod 97-10) are right."""
+    """Return the ROR in lower case. Raises DataError unless form and check digits (ISO 7064, mod 97-10) are right."""
     ror = text.lower()
     value = 0
     for digit in ror[:7] if _ROR_FORM.fullmatch(ror) else "":
@@ -124,10 +124,10 @@ def _checked_ror(text: str) -> str:
 
 
 def doi_address(text: str) -> str:
-    """The address of a DOI, which may be given with or without `doi:` or `https://doi.org/`; "" for "".
+    """Return the address of a DOI, which may be given with or without `doi:` or `https://doi.org/`; "" for "".
 
     Raises:
-        DataError: it has another form.
+        DataError: it has another format.
     """
     if not text:
         return ""
@@ -138,7 +138,7 @@ def doi_address(text: str) -> str:
 
 
 def licence_address(text: str) -> str:
-    """The address of a licence, from its SPDX identifier or its own address; "" for "".
+    """Return the address of a licence, from its SPDX identifier or its own address; "" for "".
 
     Raises:
         DataError: it is neither; the remedy names the identifier that is probably meant.
@@ -171,32 +171,32 @@ def licence_address(text: str) -> str:
 
 
 def licence_name(address: str) -> str:
-    """The SPDX identifier in an address that has one; else the address."""
+    """Return the SPDX identifier in an address that has one; else the address."""
     return address.removeprefix(_SPDX).removesuffix(".html") if address.startswith(_SPDX) else address
 
 
 FIRST_VERSION = "1.0.0"
-VERSION = r"^\d{1,6}\.\d{1,6}\.\d{1,6}$"  # of a data set: MAJOR.MINOR.PATCH
-LONGEST_NAME = 200  # of a creator, characters
+VERSION = r"^\d{1,6}\.\d{1,6}\.\d{1,6}$"  # a data set's version: MAJOR.MINOR.PATCH
+LONGEST_NAME = 200  # the longest name of a creator, characters
 _Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME)]
 _Line = Annotated[str, Field(max_length=1000)]
 
 
 class DataSetStatement(Record):
-    """What an exported data set says about itself; what is left out is said to be not stated."""
+    """An exported data set's statement about itself; what is left out is reported as not given."""
 
-    title: _Line = ""  # of the data set; without it, the protocol's title and the specimen
+    title: _Line = ""  # the data set's title; without it, the protocol's title and the specimen
     licence: _Line = ""  # SPDX identifier such as CC-BY-4.0, or the licence's address
     ethics: _Line = ""  # approval or waiver, with its number and the body that gave it
     # People, each with an ORCID if possible, or bodies, with a ROR: "Rivera, Ana 0000-0002-1825-0097".
     creators: tuple[_Name, ...] = ()
-    cite: _Line = ""  # how the data set should be cited
-    doi: _Line = ""  # of this data set, such as 10.5281/zenodo.1234567
+    cite: _Line = ""  # the way to cite the data set
+    doi: _Line = ""  # this data set's DOI, such as 10.5281/zenodo.1234567
     publisher: _Line = ""  # the body that publishes it, with its ROR if possible
     funders: tuple[_Name, ...] = ()  # bodies that paid for it, each with its ROR if possible
 
     def or_else(self, other: DataSetStatement) -> DataSetStatement:
-        """This statement, with what it leaves out taken from another."""
+        """Return this statement, with what it leaves out taken from another."""
         return DataSetStatement(
             title=self.title or other.title,
             licence=self.licence or other.licence,
@@ -209,7 +209,7 @@ class DataSetStatement(Record):
         )
 
     def problems(self) -> dict[tuple[str | int, ...], DataError]:
-        """Which identifiers are wrong, by field and index. Old records are read nonetheless, new ones refused."""
+        """Return the wrong identifiers, by field and index. Old records are read nonetheless, new ones refused."""
         found: dict[tuple[str | int, ...], DataError] = {}
         checks: tuple[tuple[tuple[str | int, ...], Callable[[str], object], str], ...] = (
             (("licence",), licence_address, self.licence),

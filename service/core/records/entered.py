@@ -28,7 +28,7 @@ class RunAbout(Record):
     specimen: _Line = ""
     purpose: _Line = ""
     site: _Line = ""
-    operator: _Line = ""  # who works at the rig; the account that began the run is in its first event
+    operator: _Line = ""  # the person at the rig; the account that started the run is in its first event
     text: _Text = ""
 
 
@@ -70,7 +70,7 @@ def about_run(
 
 
 def require_specimen(about: RunAbout) -> None:
-    """Raise ConfigurationError if the specimen is not named: nobody could tell later what was captured."""
+    """Raise ConfigurationError if the specimen is not named: nobody could say later what was captured."""
     if not about.specimen:
         raise ConfigurationError(
             "the specimen is not named",
@@ -81,14 +81,14 @@ def require_specimen(about: RunAbout) -> None:
 
 
 def about_rows(about: RunAbout | None) -> list[tuple[str, str]]:
-    """(label, text) of each field that was filled in; empty for a run without them."""
+    """Return (label, text) of each field that was filled in; empty for a run without them."""
     if about is None:
         return []
     return [(name, value) for field, name in ABOUT.items() if (value := str(getattr(about, field)))]
 
 
 def line(entered: str, what: str) -> str:
-    """`entered` as one line without control characters.
+    """Return `entered` as one line without control characters.
 
     Raises ConfigurationError, which calls the text `what`, if it is longer than LINE_CHARACTERS.
     """
@@ -96,7 +96,7 @@ def line(entered: str, what: str) -> str:
 
 
 def paragraphs(entered: str, what: str) -> str:
-    """`entered` without control characters, its line breaks kept.
+    """Return `entered` without control characters, and with its line breaks.
 
     Raises ConfigurationError, which calls the text `what`, if it is longer than TEXT_CHARACTERS.
     """

@@ -39,7 +39,7 @@ class LeftOutFile(Record):
 
 
 class ImportList(Record):
-    """What an import consists of. The same folder gives the same list, which identifies an interrupted import."""
+    """The contents of an import. The same folder gives the same list, which identifies an interrupted import."""
 
     folder: str
     views: tuple[ImportedView, ...]
@@ -47,20 +47,20 @@ class ImportList(Record):
     left_out: tuple[LeftOutFile, ...] = ()
 
     def of(self, role: PhotographRole) -> tuple[ImportedView, ...]:
-        """The photographs with this role, in order."""
+        """Return the photographs with this role, in order."""
         return tuple(view for view in self.views if view.role == role)
 
     def holds(self, role: PhotographRole | FileRole) -> bool:
-        """Whether the list has anything with this role."""
+        """Return whether the list has anything with this role."""
         return any(view.role == role for view in self.views) or any(name == role for name in self.files)
 
     def all_files(self) -> tuple[ImportedFile, ...]:
-        """Every file to be imported."""
+        """Return every file to be imported."""
         photographs = [file for view in self.views for file in (view.photograph, *view.raws)]
         return (*photographs, *(file for files in self.files.values() for file in files))
 
     def check(self, path: str, sha256: str) -> ImportedFile:
-        """The list's entry for a file that is being imported.
+        """Return the list's entry for a file that is being imported.
 
         Raises DataError if the file is not in the list, or if its bytes have changed since it was listed.
         """
@@ -78,11 +78,11 @@ class ImportList(Record):
         return found
 
     def absolute(self, file: ImportedFile) -> str:
-        """The absolute path of a file."""
+        """Return the absolute path of a file."""
         return file.path if file.path.startswith("/") else f"{self.folder}/{file.path}"
 
 
 def imported_sentence(at_utc: str, by: str) -> str:
-    """The sentence with which every page and report on an imported run begins."""
+    """Return the sentence with which every page and report on an imported run begins."""
     when = f"{at_utc[:16].replace('T', ' ')} UTC"
     return f"The photographs were imported on {when} by {by}; how the images were captured is not in evidence"

@@ -16,7 +16,7 @@ VERBS: tuple[OperatorVerb, ...] = ("confirm", "sign", "redo", "skip", "accept", 
 
 
 def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:
-    """The reason to refuse an action that a person asks for now, or None."""
+    """Return the reason to refuse an action that a person asks for now, or None."""
     refusal = recorded_refusal(protocol, state, action, actor)
     if refusal is None and action.action == "abort":
         return _reason_refusal(action, state.current)
@@ -24,7 +24,7 @@ def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: s
 
 
 def recorded_refusal(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
-    """The reason why a recorded action had no effect, or None.
+    """Return the reason why a recorded action had no effect, or None.
 
     A run could once be ended without a reason: such a record still ends its run.
     """
@@ -51,7 +51,7 @@ def recorded_refusal(protocol: Protocol, state: RunState, action: OperatorAction
 
 
 def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int) -> Refusal | None:
-    """The reason why nobody can ask a manual capture now to release the shutter or to finish, or None."""
+    """Return the reason why nobody can ask a manual capture now to release the shutter or to finish, or None."""
     if state.terminal:
         return Refusal(f"the run is {state.status}", where=step, remedy="Start a new run")
     if state.paused:
@@ -68,23 +68,23 @@ def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int
 
 
 def needs_leave(protocol: Protocol, state: RunState) -> bool:
-    """Whether a person must confirm again before the robot moves: the runner was restarted, or the leave lapsed."""
+    """Return whether a person must confirm again before the robot moves, after a restart of the runner or a lapse."""
     return (state.restarted or state.lapse is not None) and protocol.step(state.current).moves_robot
 
 
 def redo_moves(protocol: Protocol, state: RunState, step: str) -> bool:
-    """Whether the robot drives to a viewpoint of `step` as soon as that is to be redone, without asking again."""
+    """Return whether the robot moves to a viewpoint of `step` as soon as it is to be redone, without asking again."""
     under_way = state.current == step and state.phase == "running"
     return under_way and not state.paused and not needs_leave(protocol, state)
 
 
 def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
-    """The steps required by `step` that have not passed their gates; a skipped step has not."""
+    """Return the steps required by `step` that have not passed their gates; a skipped step has not."""
     return tuple(name for name in step.requires if not state.steps[name].passed_its_gates)
 
 
 def stranded(protocol: Protocol, state: RunState) -> bool:
-    """Whether the current step can never begin, because a required step has not passed and cannot be redone.
+    """Return whether the current step can never begin: a required step has not passed and cannot be redone.
 
     It may then be skipped whatever the protocol says; otherwise the run could only be ended.
     """
@@ -93,24 +93,24 @@ def stranded(protocol: Protocol, state: RunState) -> bool:
 
 
 def redo_refusal(protocol: Protocol, state: RunState, target: str) -> Refusal | None:
-    """The reason why a step cannot be done again now, or None."""
+    """Return the reason why a step cannot be done again now, or None."""
     return refuse(protocol, state, OperatorAction(action="redo", step=target, reason="asked"), "operator")
 
 
 def skip_refusal(protocol: Protocol, state: RunState) -> Refusal | None:
-    """The reason why the current step cannot be skipped now, or None."""
+    """Return the reason why the current step cannot be skipped now, or None."""
     return refuse(protocol, state, OperatorAction(action="skip", step=state.current, reason="asked"), "operator")
 
 
 def needs_signature_now(protocol: Protocol, state: RunState) -> bool:
-    """Whether a signature is due now: before an irreversible step begins, or before any other step passes."""
+    """Return whether a signature is due now: before an irreversible step begins, or before any other step passes."""
     step = protocol.step(state.current)
     due_phase = "ready" if step.irreversible else "awaiting_operator"
     return step.sign and not state.step.signed and state.phase == due_phase
 
 
 def record_to_sign(protocol: Protocol, state: RunState) -> str:
-    """SHA-256 of the event that a signature must bind now, or "" when none is due.
+    """Return the SHA-256 of the event that a signature must bind now, or "" when none is due.
 
     That is the step's gates_evaluated event. For an irreversible step it is the latest step_passed
     among the steps it requires; the chain binds the earlier ones.
@@ -126,7 +126,7 @@ def record_to_sign(protocol: Protocol, state: RunState) -> str:
 
 
 def allowed_actions(protocol: Protocol, state: RunState) -> tuple[OperatorVerb, ...]:
-    """The verbs that would be allowed now, given what they need (ticked items, a reason, a signature)."""
+    """Return the verbs that would be allowed now, given what they need (ticked items, a reason, a signature)."""
     step = protocol.step(state.current)
     full = {
         "reason": "asked",
@@ -152,7 +152,7 @@ def allowed_actions(protocol: Protocol, state: RunState) -> tuple[OperatorVerb, 
 
 
 def redoable_steps(protocol: Protocol, state: RunState) -> tuple[str, ...]:
-    """The steps that an operator could send the run back to now."""
+    """Return the steps that an operator could send the run back to now."""
     return tuple(step for step in protocol.step_ids if redo_refusal(protocol, state, step) is None)
 
 
@@ -253,7 +253,7 @@ def _redo(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
 
 
 def _has_begun(state: RunState, step: Step) -> bool:
-    """Whether a step may have changed the scene; one that began counts, a skipped one does not."""
+    """Return whether a step may have changed the scene; one that began counts, a skipped one does not."""
     there = state.steps[step.id]
     return bool(there.started_utc) or any(past.step == step.id and past.began for past in state.superseded)
 

@@ -59,7 +59,7 @@ class AskOperator:
     text: str
     checklist: tuple[str, ...]  # to be ticked with the confirmation
     options: tuple[OperatorVerb, ...]
-    sign_sha256: str = ""  # what a signature binds (OperatorAction.signed_sha256)
+    sign_sha256: str = ""  # the hash that a signature binds (OperatorAction.signed_sha256)
     ways: tuple[WayOn, ...] = ()  # the choices when the step is stopped, the recommended one first
 
 
@@ -92,7 +92,7 @@ class Accept:
 
 @dataclass(frozen=True, slots=True)
 class Retry:
-    """Wait, then append StepRetried with this attempt number; what was captured is kept."""
+    """Wait, then append StepRetried with this attempt number; what was captured stays."""
 
     step: str
     attempt: int
@@ -118,7 +118,7 @@ Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | 
 
 
 def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return per phase
-    """What the runner does next. Raises IntegrityError if nothing is recorded of the run."""
+    """Return what the runner does next. Raises IntegrityError if nothing is recorded of the run."""
     if not state.started:
         raise IntegrityError("nothing is recorded of this run", remedy="Append run_started first")
     if state.status != "active":
@@ -155,7 +155,7 @@ def _what_goes_on(step: Step, state: RunState) -> str:
 
 
 def lapsed_words(lapse: Lapse) -> str:
-    """Why a confirmation no longer holds."""
+    """Say why a confirmation no longer holds."""
     waited = f", in which the run waited for this: {lapse.why}" if lapse.why else ""
     return (
         f"The confirmation of {lapse.by} no longer lets the robot move: for {lapse.idle_s:.0f} s there was no "

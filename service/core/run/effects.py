@@ -63,7 +63,7 @@ from service.core.run.state_transitions import NOT_WAITING, UNMEASURED, change, 
 
 
 def impossible(event: Event, why: str) -> IntegrityError:
-    """The error for an event that cannot have happened in its place."""
+    """Return the error for an event that cannot have happened in its place."""
     return IntegrityError(
         f"{event.payload.kind} cannot have happened here: {why}",
         where=f"run {event.run_id} event {event.seq}",
@@ -72,7 +72,7 @@ def impossible(event: Event, why: str) -> IntegrityError:
 
 
 def triggered(protocol: Protocol, state: RunState, event: Event, trigger: str, **changes: Any) -> RunState:
-    """The state after a trigger of the lifecycle. Raises IntegrityError if it is not allowed now."""
+    """Return the state after a trigger of the lifecycle. Raises IntegrityError if it is not allowed now."""
     try:
         return go(protocol, state, trigger, **changes)
     except IllegalTransitionError as error:
@@ -85,7 +85,7 @@ def without_effect(state: RunState, event: Event) -> RunState:
 
 
 def is_void(state: RunState, event: Event, step: str, attempt: int, *, when_completed: bool = False) -> bool:
-    """Whether an operator's redo, skip or abort was recorded before the outcome of the work.
+    """Return whether an operator's redo, skip or abort was recorded before the outcome of the work.
 
     The web and the command line append actions while the runner works, so such events are legitimate; they stay in
     the evidence without effect. With `when_completed`, the work may still be recorded after the run was completed.
@@ -103,7 +103,7 @@ def is_void(state: RunState, event: Event, step: str, attempt: int, *, when_comp
 
 
 def is_void_now(state: RunState, event: Event, step: str, attempt: int) -> bool:
-    """`is_void` for events that only the current step can produce. Raises IntegrityError for another step."""
+    """Return `is_void` for events that only the current step can produce. Raises IntegrityError for another step."""
     if is_void(state, event, step, attempt):
         return True
     if step != state.current:
@@ -141,7 +141,7 @@ def device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceT
 
 
 def lost(arm: ArmConnection, seq: int, at_utc: str, how: str) -> ArmConnection:
-    """An arm whose connection was lost, since the first loss that nobody has looked at."""
+    """Return an arm whose connection was lost, since the first loss that nobody has looked at."""
     since_utc = at_utc if arm.loss is None else arm.loss.since_utc
     return replace(arm, connected=False, loss=Loss(seq, since_utc, how), lost_utc=at_utc, seen_by="", seen_utc="")
 
@@ -185,7 +185,7 @@ def leave_lapsed(protocol: Protocol, state: RunState, event: Event, p: LeaveLaps
 
 
 def with_arm(state: RunState, name: str, arm: ArmConnection) -> RunState:
-    """The state with another record of one arm."""
+    """Return the state with another record of one arm."""
     return replace(state, arms={**state.arms, name: arm})
 
 
@@ -213,7 +213,7 @@ def session_started(protocol: Protocol, state: RunState, event: Event, p: Sessio
 
 
 def files_kept(protocol: Protocol, state: RunState, event: Event, p: FilesKept) -> RunState:
-    """Files were kept for a step: no effect on the state."""
+    """Files were stored for a step: no effect on the state."""
     return without_effect(state, event) if is_void(state, event, p.step, p.attempt) else state
 
 
@@ -237,7 +237,7 @@ def run_aborted(protocol: Protocol, state: RunState, event: Event, p: RunAborted
 
 
 def worked_s(state: RunState, event: Event) -> float | None:
-    """Seconds that the work of the current step has taken; None if it did not begin."""
+    """Return the seconds that the work of the current step has taken; None if it did not begin."""
     return state.step.work_s(event.at_utc) if state.step.work_began_utc else None
 
 
@@ -290,7 +290,7 @@ def step_failed(protocol: Protocol, state: RunState, event: Event, p: StepFailed
     failure = Failure(event.seq, p.error, p.message, p.recovery, event.at_utc)
     failures = state.step.failures + 1
     tries = state.step.tries
-    if tries is None or tries.message != p.message:  # else it is the failure of a viewpoint, told before
+    if tries is None or tries.message != p.message:  # else it is the failure of a viewpoint, reported before
         tries = FailedTries("", failures, p.message, event.at_utc)
     changes = {"failure": failure, "failures": failures, "tries": tries, "worked_s": worked_s(state, event)}
     return triggered(protocol, state, event, "failed", **changes)

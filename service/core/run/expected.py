@@ -21,15 +21,18 @@ EarlierTimes = Mapping[str, Sequence[float]]  # step → seconds that its work t
 
 @dataclass(frozen=True, slots=True)
 class UsualTime:
-    """How long the work of a step usually takes, and from where that is known."""
+    """The usual duration of a step's work, and the source of this knowledge."""
 
     seconds: float
     longest_s: float
-    source: str  # in words that stand in brackets
+    source: str  # a phrase that stands in brackets
 
 
 def usual_time(protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes) -> UsualTime | None:
-    """From earlier runs of this site; before the first, from the protocol or the time for a view; None: not known."""
+    """Return how long a step usually takes; None if that is not known.
+
+    Earlier runs of this site say it; before the first, the protocol or the time for a view does.
+    """
     known = earlier.get(step.id, ())
     if known:
         runs = f"{len(known)} earlier runs" if len(known) > 1 else "one earlier run"
@@ -45,7 +48,7 @@ def usual_time(protocol: Protocol, state: RunState, step: Step, earlier: Earlier
 def work_words(
     protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str, clock: Callable[[str], str]
 ) -> str:
-    """How long the work under way usually takes, and whether it has taken too long; "" while none is under way."""
+    """Say how long the work under way usually takes, and if it has taken too long; "" while none is under way."""
     now = state.step
     if state.status != "active" or now.phase != "running" or needs_leave(protocol, state) or not now.work_began_utc:
         return ""
@@ -72,7 +75,7 @@ def work_words(
 def away_words(
     protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str, clock: Callable[[str], str]
 ) -> str:
-    """Until when nobody is asked for anything, if all goes as usual; "" if somebody is needed now or before long."""
+    """Return until when nobody is needed, if all goes as usual; "" if somebody is needed now or before long."""
     now = state.step
     if state.status != "active" or now.phase not in ("running", "checking") or needs_leave(protocol, state):
         return ""
@@ -98,7 +101,7 @@ def away_words(
 
 
 def step_words(protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes) -> str:
-    """How long a step that is still to be done usually takes; "" where that is not known, or the step is done."""
+    """Say how long a step that is still to be done usually takes; "" where that is not known, or the step is done."""
     usual = usual_time(protocol, state, step, earlier)
     if state.terminal or usual is None or state.steps[step.id].phase == "passed":
         return ""
@@ -106,7 +109,7 @@ def step_words(protocol: Protocol, state: RunState, step: Step, earlier: Earlier
 
 
 def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str) -> str:
-    """How long the work that is left of a run usually takes, without the times for which it waits for people."""
+    """Say how long the work that is left of a run usually takes, without the times for which it waits for people."""
     if state.terminal:
         return ""
     left_s, known = 0.0, 0
@@ -125,14 +128,14 @@ def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_ut
 
 
 def _left_s(usual: UsualTime, now: StepState | None, now_utc: str) -> float:
-    """The seconds that the work of a step usually still takes; all of them where it is not under way."""
+    """Return the seconds that the work of a step usually still takes; all of them where it is not under way."""
     if now is None or not now.work_began_utc:
         return usual.seconds
     return max(0.0, usual.seconds - now.work_s(now_utc))
 
 
 def duration(seconds: float) -> str:
-    """`40 s`, `12 min`, `1 h 05 min`."""
+    """Return `40 s`, `12 min`, `1 h 05 min`."""
     if seconds < 90:
         return f"{max(round(seconds / 5) * 5, 5)} s"
     minutes = round(seconds / 60)
@@ -144,14 +147,14 @@ _TIMES = ("never", "once", "twice")
 
 
 def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str] = time_utc) -> str:
-    """`b001 failed twice: no file within 46 s; third try at 20:41:07 UTC`, while the run tries again by itself.
+    """Return `b001 failed twice: no file within 46 s; third try at 20:41:07 UTC` while the run tries again by itself.
 
-    "" where nothing has failed, or where a person decides whether there is another try.
+    The text is "" where nothing has failed, or where a person decides whether there is another try.
 
     Args:
-        protocol: of the run.
-        state: of the run.
-        clock: a recorded time in words.
+        protocol: the run's protocol.
+        state: the run's state.
+        clock: turns a recorded time into text.
     """
     tries, now = state.step.tries, state.step
     if tries is None or state.status != "active" or needs_leave(protocol, state):
@@ -169,7 +172,7 @@ def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str]
 
 
 def failed_words(tries: FailedTries) -> str:
-    """`b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
+    """Return `b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
     times = _TIMES[tries.times] if tries.times < len(_TIMES) else f"{tries.times} times"
     return f"{tries.what or 'The step'} failed {times}: {what_of(tries.message)}"
 

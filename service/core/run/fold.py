@@ -82,7 +82,7 @@ from service.core.run.state_transitions import UNMEASURED, change, deviate, go, 
 
 
 def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return per verb
-    """The state after an action; an action that is not allowed is listed as refused and has no other effect."""
+    """Return the state after an action; one that is not allowed is listed as refused and has no other effect."""
     refusal = recorded_refusal(protocol, state, p, event.actor)
     if refusal is not None:
         return deviate(state, event, "refused", p.step, f"{p.action} had no effect: {refusal}")
@@ -151,7 +151,7 @@ def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, r
             state = deviate(state, event, "reset_by_redo", step, f"reset because {target} is done again: {reason}")
         if began or now.skipped:
             state = supersede(state, event, step, reason, None, now.captured)
-        # Count up even if nothing had begun, so that an outcome recorded later is known to be void.
+        # Count up even if nothing had started, so that an outcome recorded later is known to be void.
         state = replace(state, steps={**state.steps, step: StepState(step, attempt=now.attempt + 1)})
     return go(protocol, state, redo(target))
 
@@ -175,7 +175,7 @@ def _redo_viewpoint(protocol: Protocol, state: RunState, event: Event, viewpoint
 
 
 def initial_state(protocol: Protocol) -> RunState:
-    """The state before any event."""
+    """Return the state before any event."""
     machine = lifecycle(protocol.step_ids)
     steps = {step: StepState(step) for step in protocol.step_ids}
     first = protocol.step_ids[0]
@@ -184,7 +184,7 @@ def initial_state(protocol: Protocol) -> RunState:
 
 
 def fold(protocol: Protocol, events: Iterable[Event]) -> RunState:
-    """The state of a run after all these events, which begin with the first.
+    """Return the state of a run after all these events, which begin with the first.
 
     Raises IntegrityError for a system event that is impossible in its place (tampering, or a bug). An operator's
     action that was not allowed raises nothing: it is listed as refused and has no effect.
@@ -196,7 +196,10 @@ def fold(protocol: Protocol, events: Iterable[Event]) -> RunState:
 
 
 def advance(protocol: Protocol, state: RunState, event: Event) -> RunState:
-    """The state after one more event. Raises IntegrityError as `fold` does, which applies this to every event."""
+    """Return the state after one more event.
+
+    Raises IntegrityError as `fold` does, which applies this to every event.
+    """
     if event.seq != state.seq + 1:
         raise impossible(event, f"follows event {state.seq}: events are missing or repeated")
     if (event.seq == 1) != isinstance(event.payload, RunStarted):
@@ -273,7 +276,7 @@ _DETAILS: frozenset[type[Any]] = frozenset(
 
 
 def kind_of(payload: type[Any]) -> str:
-    """The name of an event kind in the record."""
+    """Return the name of an event kind in the record."""
     return str(payload.model_fields["kind"].default)
 
 

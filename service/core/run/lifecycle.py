@@ -56,12 +56,12 @@ class MachineState:
 
 
 def redo(step: str) -> str:
-    """The name of the trigger that leads back to `step`."""
+    """Return the name of the trigger that leads back to `step`."""
     return f"redo_{step}"
 
 
 def state_name(step: str, phase: Phase, *, paused: bool = False) -> str:
-    """The machine's name for a state, such as `calibration.ready` or `paused.calibration.ready`."""
+    """Return the machine's name for a state, such as `calibration.ready` or `paused.calibration.ready`."""
     return SEPARATOR.join((*((PAUSED,) if paused else ()), step, phase))
 
 
@@ -91,11 +91,11 @@ class Lifecycle:
         return self._targets
 
     def may(self, state: str, trigger: str) -> bool:
-        """Whether the table has this transition."""
+        """Return whether the table has this transition."""
         return (state, trigger) in self._targets
 
     def next(self, state: str, trigger: str) -> str:
-        """The state after `trigger`. Raises IllegalTransitionError if the table has no such transition."""
+        """Return the state after `trigger`. Raises IllegalTransitionError if the table has no such transition."""
         try:
             return self._targets[state, trigger]
         except KeyError:
@@ -106,11 +106,11 @@ class Lifecycle:
             ) from None
 
     def triggers(self, state: str) -> tuple[str, ...]:
-        """The triggers that the table has for a state."""
+        """Return the triggers that the table has for a state."""
         return tuple(trigger for source, trigger in self._targets if source == state)
 
     def place(self, state: str) -> MachineState | None:
-        """Step, phase and whether paused; None once the run has ended."""
+        """Return step, phase and whether paused; None once the run has ended."""
         return self._places.get(state)
 
 
@@ -127,12 +127,12 @@ class _Machine(HierarchicalMachine):
 
 
 def lifecycle(steps: Iterable[str]) -> Lifecycle:
-    """The machine for these step identifiers, in the protocol's order (cached)."""
+    """Return the machine for these step identifiers, in the protocol's order (cached)."""
     return _compile(tuple(steps))
 
 
 def transition_table(steps: tuple[str, ...]) -> list[tuple[str, str, str]]:
-    """The machine's rows (trigger, source, target); a source may also be a whole step or `paused` as a whole."""
+    """Return the machine's rows (trigger, source, target); a source may also be a whole step, or all of `paused`."""
     rows: list[tuple[str, str, str]] = []
     for index, step in enumerate(steps):
         # Work in progress still reports while paused, and operators may still redo: the same rules hold there.
@@ -163,7 +163,7 @@ def transition_table(steps: tuple[str, ...]) -> list[tuple[str, str, str]]:
 
 
 def state_machine(steps: tuple[str, ...]) -> HierarchicalMachine:
-    """The library's machine with all rows, which it checks; without a model, because nothing runs on it."""
+    """Return the library's machine with all rows, which it checks; without a model, because nothing runs on it."""
     nested: list[dict[str, Any]] = [{"name": step, "initial": "ready", "children": list(PHASES)} for step in steps]
     return _Machine(
         model=None,
@@ -186,7 +186,7 @@ def _compile(steps: tuple[str, ...]) -> Lifecycle:
         for step in steps
         for phase in PHASES
     }
-    outgoing: dict[str, list[tuple[str, str]]] = {}  # of a state or an enclosing state: (trigger, target)
+    outgoing: dict[str, list[tuple[str, str]]] = {}  # by a state or an enclosing state: (trigger, target)
     for trigger, event in state_machine(steps).events.items():
         for source, transitions in event.transitions.items():
             outgoing.setdefault(source, []).append((trigger, str(transitions[0].dest)))

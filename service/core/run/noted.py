@@ -12,20 +12,20 @@ class _NoteRecord(BaseModel):
 
 
 class HandWork(_NoteRecord):
-    """What a technician should do by hand, for a simulated one; further fields are those of the action."""
+    """The work that a technician should do by hand, for a simulated one; further fields are those of the action."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
-    action: str  # of simulators/rig/world_server.py
+    action: str  # its name in simulators/rig/world_server.py
 
 
 class Mending(_NoteRecord):
-    """What would bring an attempt of a step within its limits.
+    """A way to bring an attempt of a step within its limits.
 
     Attributes:
-        advice: what to do.
-        title: what is asked for, in few words, where that is the normal course of the step and nothing went wrong.
-        does: what the next confirmation does in that case, in the words of a button; "" where something went wrong.
+        advice: the advice to the technician.
+        title: the request in few words, where it is the normal course of the step and nothing went wrong.
+        does: the effect of the next confirmation in that case, as a button's label; "" where something went wrong.
         hands: the same for a simulated technician.
         viewpoints: further views that a retry takes; only their number counts.
         poses: further poses above the calibration board; only their number counts.
@@ -46,11 +46,11 @@ class NotedView(_NoteRecord):
 
     Attributes:
         viewpoint: its name.
-        outcome: feasible, nudged, or refused where the arm cannot take it.
-        reason: of a refusal.
-        nudge_deg: by how much it was turned along its arc so that the arm can take it.
-        joints_rad: of the arm there; None if refused.
-        travel_s: from the view before.
+        outcome: the planner's answer: feasible, nudged, or refused where the arm cannot take it.
+        reason: the reason of a refusal.
+        nudge_deg: the angle by which it was turned along its arc so that the arm can take it.
+        joints_rad: the arm's joints there; None if refused.
+        travel_s: the travel time from the view before.
         way_rad: joints of a detour, from those of the view before to the last before this view's; empty if straight.
     """
 
@@ -73,7 +73,7 @@ class NotedStation(_NoteRecord):
 
 
 class NotedMotionPlan(_NoteRecord):
-    """How the arm moves in a capture."""
+    """The arm's motion in a capture."""
 
     stations: tuple[NotedStation, ...] = ()
 

@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Versions(Generic[Value]):
-    """What all versions of a mapping share: the values of each key, with the version that added each."""
+    """The part that all versions of a mapping share: the values of each key, with the version that added each."""
 
     values: dict[str, list[tuple[int, Value]]] = field(default_factory=dict[str, list[tuple[int, Value]]])
     newest: int = 0
@@ -35,7 +35,7 @@ class PersistentMap(Mapping[str, Value]):
         self._shared, self._version, self._length = shared, 0, len(shared.values)
 
     def put(self, key: str, value: Value) -> PersistentMap[Value]:
-        """A new version with `value` under `key`; a new key comes last, an existing one keeps its place."""
+        """Return a new version with `value` under `key`; a new key comes last, an existing one keeps its place."""
         shared = self._shared
         with shared.lock:
             if shared.newest == self._version:
@@ -51,22 +51,22 @@ class PersistentMap(Mapping[str, Value]):
         return following
 
     def __getitem__(self, key: str) -> Value:
-        """The value of `key` in this version. Raises KeyError."""
+        """Return the value of `key` in this version. Raises KeyError."""
         for version, value in reversed(self._shared.values[key]):
             if version <= self._version:
                 return value
         raise KeyError(key)
 
     def __iter__(self) -> Iterator[str]:
-        """The keys of this version in order of insertion."""
+        """Return the keys of this version in order of insertion."""
         return iter([key for key in list(self._shared.values) if key in self])
 
     def __len__(self) -> int:
-        """The number of keys in this version."""
+        """Return the number of keys in this version."""
         return self._length
 
     def __repr__(self) -> str:
-        """`PersistentMap({…})` with the items of this version."""
+        """Return `PersistentMap({…})` with the items of this version."""
         return f"PersistentMap({dict(self)!r})"
 
     def __reduce__(self) -> tuple[type[PersistentMap[Value]], tuple[dict[str, Value]]]:
@@ -75,5 +75,5 @@ class PersistentMap(Mapping[str, Value]):
 
 
 def put(items: Mapping[str, Value], key: str, value: Value) -> PersistentMap[Value]:
-    """`items` with `value` under `key`; in constant time if `items` is the newest version of a PersistentMap."""
+    """Return `items` with `value` under `key`; in constant time for the newest version of a PersistentMap."""
     return (items if isinstance(items, PersistentMap) else PersistentMap(items)).put(key, value)

@@ -22,7 +22,7 @@ Lane = Literal["waited", "background"]
 
 
 def lane_of(priority: int) -> Lane:
-    """`waited` if a step or a person waits for jobs of this priority, else `background`."""
+    """Return `waited` if a step or a person waits for jobs of this priority, else `background`."""
     return "waited" if priority < EARLY else "background"
 
 
@@ -30,23 +30,23 @@ def lane_of(priority: int) -> Lane:
 class Loss:
     """The end of a connection to an arm, after which nobody has looked at it yet."""
 
-    seq: int  # of the newest event that tells of it: what a person answers
-    since_utc: str  # of the first loss since somebody looked
-    how: str  # in words that follow a time: `when its driver's process ended (died of SIGKILL)`
+    seq: int  # the newest event that reports it: what a person answers
+    since_utc: str  # the time of the first loss since somebody looked
+    how: str  # a phrase that follows a time: `when its driver's process ended (died of SIGKILL)`
 
 
 @dataclass(frozen=True, slots=True)
 class ArmConnection:
-    """What the record says of the connection to one arm. An arm whose connection was lost counts as moving.
+    """The recorded state of the connection to one arm. An arm whose connection was lost counts as moving.
 
     Attributes:
-        connected: whether it was opened, and no later event says that the connection has ended.
-        loss: set until a person has looked.
-        lost_utc: when a connection to it was lost last; "" if none was.
-        refused_utc: when it could not be connected; "" once it was.
-        refused_why: what the driver said then.
-        seen_by: who has looked at it since it was lost.
-        seen_utc: when.
+        connected: true if it was opened, and no later event says that the connection has ended.
+        loss: the loss of the connection, until a person has looked.
+        lost_utc: the time when a connection to it was last lost; "" if none was.
+        refused_utc: the time when it could not be connected; "" once it was.
+        refused_why: the driver's reason then.
+        seen_by: the person who has looked at it since it was lost.
+        seen_utc: the time when they looked.
     """
 
     connected: bool = False
@@ -68,12 +68,12 @@ ENDINGS: Mapping[str, str] = {
 
 
 def lost_arms(state: RunState) -> dict[str, Loss]:
-    """The arms that count as moving because a connection was lost and nobody has looked since, by name."""
+    """Return the arms that count as moving because a connection was lost and nobody has looked since, by name."""
     return {name: arm.loss for name, arm in state.arms.items() if arm.loss is not None}
 
 
 def connected_arms(state: RunState) -> tuple[str, ...]:
-    """The arms to which a connection is open, as far as the record knows."""
+    """Return the arms to which a connection is open, as far as the record knows."""
     return tuple(name for name, arm in state.arms.items() if arm.connected)
 
 
@@ -112,7 +112,7 @@ class JobState:
     message: str = ""
     priority: int = WAITED
     enqueued_utc: str = ""
-    ended_seq: int = 0  # of its job_finished or job_failed event
+    ended_seq: int = 0  # its job_finished or job_failed event
     ended_utc: str = ""
     duration_s: float = 0.0
     late_s: float | None = None  # after the specimen was freed, or the run's end; None: in time
@@ -126,7 +126,7 @@ class Note:
     at_utc: str
     note: str
     data: Mapping[str, Any]
-    attempt: int = 0  # of the step
+    attempt: int = 0  # the step's attempt
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,19 +142,19 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class FailedTries:
-    """What failed last in a step and has not succeeded since, while nobody has decided anything."""
+    """The last failure in a step that has not succeeded since, while nobody has decided anything."""
 
     what: str  # a viewpoint; "": the work of the step as a whole
     times: int
     message: str
-    at_utc: str  # of the last time
+    at_utc: str  # the time of the last failure
 
 
 @dataclass(frozen=True, slots=True)
 class AcceptedDeviation:
     """A person's acceptance of a step's figures outside their limits."""
 
-    seq: int  # of the operator_action event
+    seq: int  # the operator_action event
     by: str
     role: str
     identified: Identified
@@ -170,27 +170,27 @@ class StepState:
     attempt: int = 1
     phase: StepPhase = "pending"
     confirmed: bool = False
-    confirmed_by: str = ""  # who let the present work begin, by confirming the step or its retry
+    confirmed_by: str = ""  # the person who let the present work begin, by confirming the step or its retry
     ticked: tuple[str, ...] = ()  # checklist items of the confirmation
     signed: bool = False
     signed_by: str = ""
     skipped: bool = False
     retry_granted: bool = False  # an operator confirmed in recovering
-    measures: Mapping[str, float] = field(default_factory=dict[str, float])  # of this attempt
-    artefacts: tuple[ArtefactRef, ...] = ()  # of this attempt's step_measured
+    measures: Mapping[str, float] = field(default_factory=dict[str, float])  # this attempt's measures
+    artefacts: tuple[ArtefactRef, ...] = ()  # the artefacts of this attempt's step_measured
     result: Mapping[str, Any] = field(default_factory=dict[str, Any])
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
     computed_by: tuple[ComputedBy, ...] | None = None  # jobs of the measures and the result; None: not recorded
     verdicts: tuple[GateVerdict, ...] = ()
     gates_passed: bool = False
-    gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
+    gates_sha256: str = ""  # the hash of the gates_evaluated event: what a signature of this step binds
     accepted: AcceptedDeviation | None = None  # set if a person accepted figures outside the limits
-    passed_sha256: str = ""  # of the step_passed event: what the signature of an irreversible step binds
+    passed_sha256: str = ""  # the hash of the step_passed event: what the signature of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None
     tries: FailedTries | None = None
     failures: int = 0  # consecutive failures without a captured viewpoint or a confirmation in between
-    # Viewpoints, notes and jobs are kept by a retry and cleared by a redo.
+    # Viewpoints, notes and jobs stay after a retry and cleared by a redo.
     captured: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → seq of its event
     viewpoint_failures: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → times
     skipped_viewpoints: tuple[str, ...] = ()  # given up
@@ -199,24 +199,24 @@ class StepState:
     jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
     started_utc: str = ""
     ended_utc: str = ""
-    work_began_utc: str = ""  # of the present attempt
+    work_began_utc: str = ""  # the start of the present attempt's work
     waits_since_utc: str = ""  # the arm's work waits for a person: it was paused, or the leave to move is over
-    waited_s: float = 0.0  # for which it waited so until then, since the work began
-    worked_s: float | None = None  # how long the last attempt worked until it had its figures or failed
+    waited_s: float = 0.0  # the time that it waited so until then, since the work began
+    worked_s: float | None = None  # the time that the last attempt worked until it had its figures or failed
 
     def work_s(self, now_utc: str) -> float:
-        """Seconds that the present attempt has worked until a time (ISO 8601), without those for which it waited."""
+        """Return the seconds that this attempt has worked until a time (ISO 8601), waiting excluded."""
         waits_s = seconds_between(self.waits_since_utc, now_utc) if self.waits_since_utc else 0.0
         return max(0.0, seconds_between(self.work_began_utc, now_utc) - self.waited_s - waits_s)
 
     @property
     def passed_its_gates(self) -> bool:
-        """Whether the step passed with its figures within limits or accepted; a skipped step did not."""
+        """True if the step passed with its figures within limits or accepted; a skipped step did not."""
         return self.phase == "passed" and (self.gates_passed or self.accepted is not None) and not self.skipped
 
     @property
     def mend(self) -> Mending | None:
-        """What would bring this attempt within limits, by its newest note with `advice`; None without one.
+        """The way to bring this attempt within limits, by its newest note with `advice`; None without one.
 
         Advice in earlier notes is out of date and is ignored, `hands` included.
         """
@@ -228,7 +228,7 @@ class StepState:
 
     @property
     def in_course(self) -> Mending | None:
-        """What the step asks for in its normal course before it can be judged; None where something went wrong."""
+        """The step's request in its normal course before it can be judged; None where something went wrong."""
         mend = self.mend if self.phase == "recovering" and self.failure is None else None
         return mend if mend is not None and mend.does else None
 
@@ -244,13 +244,13 @@ class StepState:
 class Superseded:
     """An attempt, or one viewpoint of it, that a later one replaced. Its evidence stays."""
 
-    seq: int  # of the event that superseded it
+    seq: int  # the event that superseded it
     step: str
     attempt: int
     reason: str
     viewpoint: str | None = None
     captured: Mapping[str, int] = field(default_factory=dict[str, int])
-    began: bool = True  # whether its work had begun
+    began: bool = True  # true if its work had started
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +276,7 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """Who gave leave for the robot to move, and in which event."""
+    """The person who gave leave for the robot to move, and the event in which they did."""
 
     seq: int
     by: str
@@ -286,11 +286,11 @@ class Leave:
 class Lapse:
     """A leave to move that is over because nothing visible came of it for too long, until somebody gives another."""
 
-    seq: int  # of the event
-    by: str  # who had given it
+    seq: int  # the event
+    by: str  # the person who had given it
     idle_s: float
     limit_s: float
-    why: str  # what the run had waited for; "" if it is not known
+    why: str  # the thing that the run had waited for; "" if it is not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,12 +319,12 @@ class DrawnRegion:
 class RunState:
     """The fold of a run's events."""
 
-    machine_state: str  # of service.core.run.lifecycle
+    machine_state: str  # its state in service.core.run.lifecycle
     current: str  # identifier of the step that the run is at, or was at when it ended
     steps: Mapping[str, StepState]
     status: Status = "active"
-    seq: int = 0  # of the last event; 0: nothing recorded yet
-    at_utc: str = ""  # of the last event
+    seq: int = 0  # the last event; 0: nothing recorded yet
+    at_utc: str = ""  # the time of the last event
     run_id: str = ""
     operator: str = ""
     simulated: bool = False
@@ -333,8 +333,8 @@ class RunState:
     sessions: int = 0
     restarted: bool = False  # a new process drives the run, and nobody has confirmed or resumed since
     leave: Leave | None = None  # the newest one in this session; each arm takes it once
-    lapse: Lapse | None = None  # of the leave, if nobody has given another since
-    arms: Mapping[str, ArmConnection] = field(default_factory=dict[str, ArmConnection])  # by name in rig.yaml
+    lapse: Lapse | None = None  # the lapse of the leave, if nobody has given another since
+    arms: Mapping[str, ArmConnection] = field(default_factory=dict[str, ArmConnection])  # arms by name in rig.yaml
     stop_reason: str = ""
     # The one list of what departed from the protocol: whoever counts or lists deviations takes it whole. A gate that
     # failed, a device that failed and a corrected value are none by themselves: what a person did about it is.
@@ -344,12 +344,12 @@ class RunState:
     overtaken: tuple[int, ...] = ()  # seq of events that an operator's action had already made void
     troubles: tuple[Trouble, ...] = ()
     last_redo_seq: int = 0
-    people: frozenset[str] = frozenset()  # who took part: started it, controlled it, acted on it
+    people: frozenset[str] = frozenset()  # those who took part: started it, controlled it, acted on it
     controller: str = ""  # person whose screen controls the run; "" for nobody
     corrections: tuple[Correction, ...] = ()
     drawn: tuple[DrawnRegion, ...] = ()  # regions of the ground truth that people drew, the latest last
-    ended_utc: str = ""  # of run_completed or run_aborted
-    completed_sha256: str = ""  # of the run_completed event: what a release binds
+    ended_utc: str = ""  # the time of run_completed or run_aborted
+    completed_sha256: str = ""  # the hash of the run_completed event: what a release binds
     released_by: str = ""
     view_gaps_s: tuple[float, ...] = ()  # seconds between successive views of the same work, the latest ones
     last_view: tuple[str, str] = ("", "")  # step and time of the latest view of the present work
@@ -368,12 +368,12 @@ class RunState:
 
     @property
     def started(self) -> bool:
-        """Whether run_started has been recorded."""
+        """True if run_started has been recorded."""
         return self.seq > 0
 
     @property
     def paused(self) -> bool:
-        """Whether an operator has paused the run."""
+        """True if an operator has paused the run."""
         return self.status == "paused"
 
     @property
@@ -383,10 +383,10 @@ class RunState:
 
     @property
     def terminal(self) -> bool:
-        """Whether the run has ended, completed or aborted."""
+        """True if the run has ended, completed or aborted."""
         return self.status in ("completed", "aborted")
 
     @property
     def deviations_told(self) -> str:
-        """The number of deviations in words, such as `1 deviation`."""
+        """The number of deviations as text, such as `1 deviation`."""
         return counted(len(self.deviations), "deviation")

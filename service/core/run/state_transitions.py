@@ -31,14 +31,14 @@ NOT_WAITING: Mapping[str, Any] = {"waits_since_utc": "", "waited_s": 0.0}
 
 
 def wait(protocol: Protocol, state: RunState, event: Event) -> RunState:
-    """The arm's work waits from now on for a person; work without an arm goes on meanwhile."""
+    """Let the arm's work wait from now on for a person; work without an arm goes on meanwhile."""
     if not protocol.step(state.current).moves_robot or state.step.waits_since_utc:
         return state
     return change(state, state.current, waits_since_utc=event.at_utc)
 
 
 def wait_no_more(state: RunState, event: Event) -> RunState:
-    """A person has let the work go on."""
+    """Record that a person has let the work go on."""
     since_utc, waited_s = state.step.waits_since_utc, state.step.waited_s
     if not since_utc:
         return state

@@ -1,1 +1,1 @@
-"""Reading text files with line numbers for every problem, and the words that people read."""
+"""Reads text files with line numbers for every problem, and has the texts that people read."""

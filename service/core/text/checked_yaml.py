@@ -59,7 +59,7 @@ class YamlTree:
     problems: tuple[YamlProblem, ...]
 
     def line(self, path: FieldPath) -> int:
-        """The line of a field, or of the nearest enclosing field that is in the file."""
+        """Return the line of a field, or of the nearest enclosing field that is in the file."""
         while path not in self.lines:
             path = path[:-1]
         return self.lines[path]
@@ -69,7 +69,7 @@ NO_LINES = YamlTree(data={}, lines={(): 0}, problems=())  # for data that is not
 
 
 def field_name(path: FieldPath) -> str:
-    """`steps[3].gates[0].max` for ("steps", 3, "gates", 0, "max")."""
+    """Return `steps[3].gates[0].max` for ("steps", 3, "gates", 0, "max")."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
 
 
@@ -106,7 +106,7 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
 
 
 def _composed(text: str, name: str) -> Node | None:
-    """The tree of the text, by libyaml where PyYAML has it and the text is one that both read alike.
+    """Return the tree of the text, by libyaml where PyYAML has it and the text is one that both read alike.
 
     PyYAML's own parser has the last word on what is wrong, and in which line.
     """
@@ -137,13 +137,13 @@ class _ShallowComposer(Composer):
             return super().compose_mapping_node(anchor)
 
     def descend_resolver(self, current_node: Any, current_index: Any) -> None:
-        """Nothing: tags have no meaning here."""
+        """Do nothing: tags have no meaning here."""
 
     def ascend_resolver(self) -> None:
-        """Nothing, likewise."""
+        """Do nothing, likewise."""
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> str:
-        """No tag."""
+        """Return no tag."""
         return ""
 
     @contextmanager
@@ -256,7 +256,7 @@ def decoded(content: bytes, *, name: str, error: type[OrthocaptureError]) -> str
 def checked(
     data: Plain, model: type[ModelT], tree: YamlTree, at: FieldPath = ()
 ) -> tuple[ModelT | None, list[YamlProblem]]:
-    """Part of a file as an instance of `model`, or None and what is wrong with it.
+    """Read part of a file as an instance of `model`; return it, or None, and what is wrong with it.
 
     Types are strict, as in JSON: quoted text is not a number, and `yes` is not a boolean.
 
@@ -264,7 +264,7 @@ def checked(
         data: the data at `at` in the file.
         model: the pydantic model of that part.
         tree: the file, for line numbers.
-        at: path to the part within the file.
+        at: the path to the part within the file.
     """
     try:
         return model.model_validate_json(json.dumps(data), strict=True), []
@@ -273,7 +273,7 @@ def checked(
 
 
 def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at: FieldPath = ()) -> YamlProblem:
-    """A pydantic error in plain words, with its line; the instance of `model` begins at path `at`."""
+    """Return a pydantic error in plain English, with its line; the instance of `model` begins at path `at`."""
     start = len(at)
     for part in details["loc"]:
         if (*at, part) in tree.lines:  # pydantic also puts names of union members into the path
@@ -292,7 +292,7 @@ def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """` (did you mean 'title'?)` if a known word is similar, else ""."""
+    """Return ` (did you mean 'title'?)` if a known word is similar, else ""."""
     near = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
@@ -303,10 +303,10 @@ def refuse(
     """Raise `error` listing every problem in the order of its line.
 
     Args:
-        problems: at least one.
+        problems: the problems, one or more.
         what: the kind of file, such as "protocol".
         name: the file's name.
-        remedy: what the reader should do.
+        remedy: the advice to the reader.
         error: the class to raise.
     """
     ordered = sorted(set(problems), key=lambda p: (p.line, p.field))
@@ -318,7 +318,7 @@ def refuse(
 
 
 def _known(model: type[BaseModel], path: FieldPath) -> Mapping[str, object]:
-    """The fields of the model at `path` within `model`, for suggestions."""
+    """Return the fields of the model at `path` within `model`, for suggestions."""
     models = [model]
     for part in path:
         fields = [each.model_fields[part] for each in models if isinstance(part, str) and part in each.model_fields]
@@ -327,7 +327,7 @@ def _known(model: type[BaseModel], path: FieldPath) -> Mapping[str, object]:
 
 
 def _records(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models named in a field's type, also within tuples, mappings and unions."""
+    """Yield the models named in a field's type, also within tuples, mappings and unions."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inside in get_args(annotation):

@@ -34,11 +34,11 @@ _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "spaces"}
 
 @dataclass(frozen=True, slots=True)
 class TextDialect:
-    """How the fields of a file are written.
+    """The way in which a file writes its fields.
 
     Attributes:
-        separator: "," or ";" or a tab, or " " for any run of spaces and tabs.
-        decimal: "." or ",".
+        separator: the character between fields: "," or ";" or a tab, or " " for any run of spaces and tabs.
+        decimal: the decimal mark: "." or ",".
     """
 
     separator: str
@@ -58,9 +58,9 @@ class TextTable:
     """The fields of a file.
 
     Attributes:
-        rows: without empty lines and comments; numbers have a decimal point, however the file writes them.
+        rows: the rows without empty lines and comments; numbers have a decimal point, however the file writes them.
         comments: lines that begin with #, without it; programs write their header so.
-        dialect: of the file.
+        dialect: the file's way of writing fields.
     """
 
     rows: tuple[TextRow, ...]
@@ -69,7 +69,7 @@ class TextTable:
 
 
 def decoded(data: bytes, where: str, *, numbers_only: bool = False) -> str:
-    """The text of UTF-8 or UTF-16, with or without a byte order mark.
+    """Return the text of UTF-8 or UTF-16, with or without a byte order mark.
 
     Args:
         data: the whole file.
@@ -108,15 +108,15 @@ def _unmarked(data: bytes) -> str:
 
 
 def is_number(cell: str) -> bool:
-    """Whether a field is a number with a decimal point or none."""
+    """Return whether a field is a number with a decimal point or none."""
     return _PLAIN.fullmatch(cell) is not None
 
 
 def read_table(data: bytes, where: str, *, numbers_only: bool = False) -> TextTable:
-    """The fields of a file of delimited text.
+    """Return the fields of a file of delimited text.
 
     Raises:
-        DataError: another encoding, a quote that is not closed, or a form that can be read in two ways; `where` has
+        DataError: another encoding, a quote that is not closed, or a format that can be read in two ways; `where` has
             the line if it is one line's fault.
     """
     lines: list[tuple[int, str]] = []
@@ -158,7 +158,7 @@ def _empty_at_end(cells: Sequence[str]) -> int:
 
 
 def splitter(dialect: TextDialect) -> Callable[[str], tuple[str, ...]]:
-    """What splits a line into its fields, whose numbers it writes with a decimal point. It raises csv.Error."""
+    """Return what splits a line into its fields and gives their numbers a decimal point. It raises csv.Error."""
 
     def split(line: str) -> tuple[str, ...]:
         cells = [cell.strip() for cell in _cells(line, dialect.separator)]
@@ -178,10 +178,10 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def dialect_of(lines: Sequence[str], where: str, *, separator: str = "") -> TextDialect:
-    """How these lines, or the first of many, write their fields. `separator`: as the file states it.
+    """Return how these lines, or the first of many, write their fields. `separator`: the one that the file gives.
 
     Raises:
-        DataError: decimal commas cannot be told from separators or from marks of thousands.
+        DataError: decimal commas cannot be distinguished from separators or from marks of thousands.
     """
     found = separator or _separator(lines)
     rows = [[cell.strip() for cell in _lenient(line, found)] for line in lines]
@@ -193,12 +193,12 @@ def dialect_of(lines: Sequence[str], where: str, *, separator: str = "") -> Text
 def _lenient(line: str, separator: str) -> list[str]:
     try:
         return _cells(line, separator)
-    except csv.Error:  # told with its line when the rows are read
+    except csv.Error:  # reported with its line when the rows are read
         return []
 
 
 def _separator(lines: Iterable[str]) -> str:
-    """The separator that each line has; a comma before a semicolon or a space can be a decimal comma."""
+    """Return the separator that each line has; a comma before a semicolon or a space can be a decimal comma."""
     bare = [re.sub(r'"[^"]*"', '""', line) for line in lines]
     bare = [line for line in bare if _ENDS_IN_NUMBER.search(line)] or bare  # not the titles above a table
     for candidate in (";", "\t"):
@@ -239,7 +239,7 @@ def _decimal(rows: Iterable[Sequence[str]], separator: str, where: str) -> str:
 
 
 def _refuse_doubled(rows: Sequence[Sequence[str]], where: str) -> None:
-    """Raise if commas separate the fields and, by their count or form, also whole numbers from decimals."""
+    """Raise if commas separate the fields and, by their count or format, also whole numbers from decimals."""
     numbers = [row for row in rows if row and _WHOLE.fullmatch(row[-1])]
     if not numbers or len({len(row) for row in numbers}) > 1:
         return

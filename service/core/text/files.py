@@ -12,12 +12,12 @@ from service.core.text.delimited_text import decoded, read_table
 
 
 def file_text(path: Path) -> str:
-    """The text of a UTF-8 or UTF-16 file, with or without a mark. Raises DataError if it cannot be read."""
+    """Return the text of a UTF-8 or UTF-16 file, with or without a mark. Raises DataError if it cannot be read."""
     return decoded(file_bytes(path), str(path))
 
 
 def file_bytes(path: Path) -> bytes:
-    """The content of a file. Raises DataError if it cannot be read."""
+    """Return the content of a file. Raises DataError if it cannot be read."""
     try:
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: an impossible path, such as one with a null byte
@@ -45,7 +45,7 @@ def parse_json(text: str | bytes, *, name: str, remedy: str = "Correct the file"
     Args:
         text: the document; bytes are decoded as UTF-8, with or without a byte order mark.
         name: the file's name in errors.
-        remedy: what an error tells the reader to do.
+        remedy: the advice of an error to the reader.
 
     Raises:
         DataError: not UTF-8, not JSON, a name given twice in an object, or nested more than 100 deep.
@@ -83,7 +83,7 @@ def _integer(digits: str) -> int | float:
 
 
 def _is_deep(document: object) -> bool:
-    """Whether a document is nested deeper than MOST_DEEP; iterative, because recursion could overflow."""
+    """Return whether a document is nested deeper than MOST_DEEP; iterative, because recursion could overflow."""
     level: list[object] = [document]
     for _ in range(MOST_DEEP + 1):
         level = [

@@ -52,7 +52,7 @@ _UNSEEN = frozenset(
 
 
 def person_name(typed: str) -> str:
-    """The name that was typed, in the one form in which names are stored.
+    """Return the name that was typed, in the one format in which names are stored.
 
     Raises ConfigurationError if it is not a person's name, or one that the software itself acts under.
     """
@@ -64,16 +64,16 @@ def person_name(typed: str) -> str:
 
 
 def cleaned_name(typed: str) -> str:
-    """What is left of a typed name without everything that no name has; "unknown" if that is nothing.
+    """Return a typed name without everything that no name has; "unknown" if nothing is left.
 
-    For what must never be refused because of a name, such as a pause.
+    It serves what must never be refused because of a name, such as a pause.
     """
     kept = "".join(c for c in _same_form(typed) if c in _BETWEEN or not _unusual(c))
     return " ".join(kept.split())[:NAME_CHARACTERS].strip() or "unknown"
 
 
 def looks_of(name: str) -> str:
-    """What a name looks like: two different names with the same looks may be taken for each other."""
+    """Return a name's looks: two different names with the same looks may be mistaken for each other."""
     plain = unicodedata.normalize("NFKD", _same_form(name).casefold())
     bare = "".join(c for c in plain if unicodedata.combining(c) < _ABOVE_AND_BELOW).translate(_LOOKS)
     return bare.replace("rn", "m").replace("vv", "w")
@@ -84,7 +84,7 @@ def _same_form(typed: str) -> str:
 
 
 def _faults(name: str) -> Iterator[str]:
-    """Why a text is no name; nothing if it is one."""
+    """Yield why a text is no name; nothing if it is one."""
     if not name:
         yield "it is empty"
         return
@@ -109,7 +109,7 @@ def _faults(name: str) -> Iterator[str]:
 
 
 def _unusual(character: str) -> str:
-    """Why no name has this character, apart from those between its parts; "" if names have it."""
+    """Return why no name has this character, apart from those between its parts; "" if names have it."""
     category, script = unicodedata.category(character), _script(character)
     base = unicodedata.normalize("NFKD", character)[0]
     if category == "Nd" and not character.isascii():
@@ -126,7 +126,7 @@ def _unusual(character: str) -> str:
 
 
 def _script(character: str) -> str:
-    """The script of a letter, as the first word of its name in Unicode tells; those of East Asia go together."""
+    """Return a letter's script, which the first word of its Unicode name gives; those of East Asia are one."""
     first = unicodedata.name(character, "UNNAMED").split()[0]
     return "EAST ASIAN" if first in _EAST_ASIAN else first
 

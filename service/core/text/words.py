@@ -8,17 +8,17 @@ from service.core.errors import OrthocaptureError
 
 
 def counted(number: int, one: str, more: str = "") -> str:
-    """A count in words: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""
+    """Return a count as text: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""
     return f"{number or 'no'} {one if number in (0, 1) else more or one + 's'}"
 
 
 def time_utc(at_utc: str) -> str:
-    """The time of day of a recorded time (ISO 8601): `20:41:07 UTC`."""
+    """Return the time of day of a recorded time (ISO 8601): `20:41:07 UTC`."""
     return f"{at_utc[11:19]} UTC"
 
 
 def local_time(at_utc: str) -> str:
-    """A recorded time on the clock of this machine and its site: `10:12:03 CET`; "" where that is UTC itself."""
+    """Return a recorded time on the clock of this machine and its site: `10:12:03 CET`; "" where that is UTC."""
     try:
         there = datetime.fromisoformat(at_utc).astimezone()
     except ValueError:
@@ -30,7 +30,7 @@ def local_time(at_utc: str) -> str:
 
 
 def time_here(at_utc: str) -> str:
-    """The time of day of a recorded time on the clock on the wall, and in UTC only where that is the same."""
+    """Return the time of day of a recorded time on the clock on the wall, and in UTC only where that is the same."""
     return local_time(at_utc) or time_utc(at_utc)
 
 
@@ -38,7 +38,7 @@ REASON_CHARACTERS = 2000
 
 
 def reason_of(typed: str, error: type[OrthocaptureError]) -> str:
-    """The reason without outer blanks. Raises this error if it says nothing, or more than anybody reads."""
+    """Return the reason without outer blanks. Raises this error if it says nothing, or more than anybody reads."""
     plain = typed.strip()
     if not plain or len(plain) > REASON_CHARACTERS:
         raise error(

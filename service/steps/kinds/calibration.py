@@ -36,12 +36,12 @@ _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of
 
 
 class Params(MovingParams):
-    """Which board images are taken, and what is computed from them."""
+    """The board images to take, and the calibrations to compute from them."""
 
     gives: ClassVar = "calibration"
     repeated: ClassVar = RepeatedStep("Take the board images that are missing and compute again; the others are kept")
 
-    solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
+    solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # the calibrations to compute
     board_poses: BoardPoses | None = None  # images whose poses the software plans
     viewpoints: tuple[ViewpointSet, ...] = ()  # or images from these viewpoints
     # Use the images of this earlier calibration step instead of new ones.
@@ -51,7 +51,7 @@ class Params(MovingParams):
 
     @property
     def moves_robot(self) -> bool:
-        """Whether new images are taken."""
+        """True if new images are taken."""
         return self.images_of is None
 
     @property
@@ -67,7 +67,7 @@ class Params(MovingParams):
 
 
 class Measures(CaptureMeasures):
-    """Of the board images, the intrinsics and the hand-eye transform."""
+    """The measures of the board images, the intrinsics and the hand-eye transform."""
 
     views: Annotated[Count, "board images that were used"] = None
     views_without_board: Annotated[Count, "board images in which no board was found"] = None
@@ -171,7 +171,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def board_of_protocol(context: StepContext) -> Board:
-    """The protocol's board. Raises ConfigurationError if it describes none."""
+    """Return the protocol's board. Raises ConfigurationError if it describes none."""
     from service.compute.board.board import Board  # noqa: PLC0415 - as above
 
     board = context.protocol.board
@@ -183,7 +183,7 @@ def board_of_protocol(context: StepContext) -> Board:
 
 
 def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Answer] | None:
-    """The answer with the intrinsics of an earlier step, if this one does not solve them."""
+    """Return the answer with the intrinsics of an earlier step, if this one does not solve them."""
     if "intrinsics" in params.solve:
         return None
     if params.intrinsics_of is None:
@@ -209,7 +209,7 @@ def _board_capture(
 
 
 def _as_board_poses(sets: tuple[ViewpointSet, ...]) -> BoardPoses:
-    """The planning parameters for replacements of listed viewpoints."""
+    """Return the planning parameters for replacements of listed viewpoints."""
     arcs = [arc for one in sets for arc in one.arcs]
     offset = sets[-1].aim_offset_m[2]
     return BoardPoses(
@@ -254,7 +254,7 @@ def _solve(
 
 
 def _stated_of_board(context: StepContext, camera: EarlierAnswer[calibrate.Answer] | None) -> dict[str, Any]:
-    """What the protocol states of its board, and how the calibration of the camera has seen it, where they do."""
+    """Return what the protocol and the camera's calibration say of the board, as far as they do."""
     board = context.protocol.board
     stated: dict[str, Any] = {}
     if board is not None and board.size_tolerance_percent is not None:

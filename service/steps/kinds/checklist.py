@@ -19,14 +19,14 @@ class Params(StepParams):
 
 
 class Measures(MeasureRecord):
-    """What the operator ticked when confirming."""
+    """The items that the operator ticked when confirming, and those left open."""
 
     checklist_items_open: Annotated[Count, "items that are not ticked"] = None
     checklist_items_ticked: Annotated[Count, "items that are ticked"] = None
 
 
 class Result(Record):
-    """How many items were ticked."""
+    """The number of items that were ticked."""
 
     items: int
     ticked: int

@@ -20,14 +20,14 @@ from service.steps.measures import Count, Measure, SphereMeasures
 
 
 class Params(StepParams):
-    """What to expect from the CT suite."""
+    """The files and spheres to expect from the CT suite."""
 
     gives: ClassVar = "ct_surface"
     repeated: ClassVar = RepeatedStep("Put another series into the CT folder and import it")
 
     # mesh: segmented by other software (Mimics STL); segmentation: a series, and a DICOM SEG or NIfTI file of it
     source: Literal["dicom", "mesh", "segmentation"] = "dicom"
-    segments: tuple[str, ...] = ()  # of the segmentation: labels, in NIfTI files numbers; empty: all
+    segments: tuple[str, ...] = ()  # the segmentation's labels, in NIfTI files numbers; empty: all
     threshold_hu: float = -450.0  # half way between air and tissue or plastic: unbiased surfaces
     spheres: int  # number of registration and control spheres in the volume
     wait_s: float = 600.0  # longest wait until the series is complete
@@ -39,7 +39,7 @@ class Params(StepParams):
 
 
 class Measures(SphereMeasures):
-    """Of the series, and of the spheres in its surface."""
+    """The measures of the series, and of the spheres in its surface."""
 
     slices: Annotated[Count, "slices of the series"] = None
     images_elsewhere: Annotated[
@@ -112,7 +112,7 @@ def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Art
     measures = {
         **found,
         "slices": float(series.slices),
-        "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # DICOM states positions with six decimal places
+        "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # DICOM gives positions with six decimal places
         "voxel_mm": round(mm(max(volume.spacing_m)), 6),
     }
     return JobRequest.of(ct_surface.KIND, arguments), kept + labels, measures
@@ -134,7 +134,7 @@ def _labels(
 
 
 def _sound(ct: CtSource) -> Sequence[CtSeries]:
-    """The series without faults, oldest first.
+    """Return the series without faults, oldest first.
 
     Raises DataError if the newest is one of several in the same frame of reference, such as the products of one
     acquisition of a photon-counting suite: all show the specimen, with other values.

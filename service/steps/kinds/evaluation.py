@@ -31,7 +31,7 @@ _SCAN, _CONTROL, _CT = "scan", "control_scan", "ct"  # fields of the job's argum
 
 
 class Params(StepParams):
-    """Where the control spheres were photographed and measured."""
+    """The photographs and the scan that show the control spheres."""
 
     gives: ClassVar = "accuracy"
     repeated: ClassVar = RepeatedStep(

@@ -27,22 +27,23 @@ from service.steps.registration_sources import decisive
 
 
 class _Posed(Mounting):
-    """What a registration was told of its images' poses."""
+    """The images and the source of their poses, as a registration received them."""
 
     images: tuple[PosedPhotograph, ...]
     poses: str
 
 
 def with_located_images(registered: JobState, jobs: Jobs) -> JobRequest:
-    """The request of a registration, for another mesh, whose images stand where the spheres of the first placed them.
+    """Return a registration's request for another mesh, whose images stand where the first one's spheres placed them.
 
-    As it was where their poses were known before: by an arm, from a capture by hand, or by structure from motion.
+    The request is unchanged where their poses were known before: by an arm, from a capture by hand, or by structure
+    from motion.
     Otherwise each mesh would locate the images by its own spheres, in its own frame, and the two could not be
     compared.
 
     Args:
         registered: the finished job `register` of the first mesh.
-        jobs: of the run, for references.
+        jobs: the run's jobs, for references.
     """
     recorded = dict(registered.arguments)
     known = read_part(_Posed, recorded, jobs)
@@ -65,14 +66,14 @@ _Mm = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class WoundRegion(Record):
     """A part of space whose source a person chooses, against the proposal: an extruded polygon or a box."""
 
-    source: Literal["ct", "scan"] = "ct"  # what counts there
-    frame: fuse.Frame = "world"  # of the positions; world: the base of the first station
-    corners_mm: tuple[Point, ...] = ()  # of a polygon, in order: x, y, z
-    along: Point | None = None  # from the polygon to its viewer; None: away from the table
-    below_mm: float = 40.0  # how far the polygon reaches below its lowest corner
-    above_mm: float = 5.0  # how far it reaches above its highest corner
-    centre_mm: Point | None = None  # of a box along the axes of the frame
-    size_mm: Point | None = None  # of the box
+    source: Literal["ct", "scan"] = "ct"  # the source that counts there
+    frame: fuse.Frame = "world"  # the frame of the positions; world: the base of the first station
+    corners_mm: tuple[Point, ...] = ()  # the corners of a polygon, in order: x, y, z
+    along: Point | None = None  # the direction from the polygon to its viewer; None: away from the table
+    below_mm: float = 40.0  # the polygon's reach below its lowest corner
+    above_mm: float = 5.0  # the polygon's reach above its highest corner
+    centre_mm: Point | None = None  # the centre of a box along the axes of the frame
+    size_mm: Point | None = None  # the size of the box
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
@@ -83,7 +84,7 @@ class WoundRegion(Record):
 
 
 class Params(StepParams):
-    """Which surfaces are fused, and how."""
+    """The surfaces that are fused, and how."""
 
     gives: ClassVar = "ground_truth"
     repeated: ClassVar = RepeatedStep("Correct the wound's region, then fuse again", same=True, device=False)
@@ -93,13 +94,13 @@ class Params(StepParams):
     # Step whose camera poses place both meshes; None: by the spheres alone.
     registration: Annotated[str | None, NAMES_REGISTRATION] = None
     blend_mm: _Mm = 3.0  # width of the overlap over which the mesh changes from the CT to the scan
-    chamfer_spacing_mm: _Mm = 0.1  # of the samples for the Chamfer distance
+    chamfer_spacing_mm: _Mm = 0.1  # the spacing of the samples for the Chamfer distance
     cut_posts_mm: _Mm | None = None  # cuts out spheres, and posts of this radius below them; None: they stay
     wound: tuple[WoundRegion, ...] = ()  # corrections of the proposed wound; a later one overrules an earlier one
 
 
 class Measures(MeasureRecord):
-    """Of CT and scan in one frame, and of the fused mesh."""
+    """The measures of CT and scan in one frame, and of the fused mesh."""
 
     spheres_compared: Annotated[Count, "spheres found in both CT and scan"] = None
     spheres_moved: Annotated[Count, "spheres that moved by more than their uncertainty explains"] = None
@@ -138,7 +139,7 @@ class Measures(MeasureRecord):
 
 
 class Result(Record):
-    """How the ground truth was made, as the job reports it. Without a CT nothing is fused: the scan is the truth."""
+    """The ground truth's making, as the job reports it. Without a CT nothing is fused: the scan is the truth."""
 
     without: str = ""  # the skipped step that it would need
     registration: str = ""  # name of the registration that closed the loop
@@ -180,7 +181,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _regions(context: StepContext, params: Params) -> tuple[fuse.Region, ...]:
-    """The regions of the protocol, then those that people drew for this step on the 3D view."""
+    """Return the regions of the protocol, then those that people drew for this step on the 3D view."""
     author = f"protocol {context.protocol.id} {context.protocol.version}"
     drawn = (found for found in context.run.drawn if found.region.step == context.step.id)
     return (
@@ -219,7 +220,7 @@ def _region(region: WoundRegion, author: str) -> fuse.Region:
 
 
 def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> tuple[str, JobState, JobState]:
-    """The name of the registration that is used, its job for the scan, and the same for the CT."""
+    """Return the name of the registration that is used, its job for the scan, and the same for the CT."""
     found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(step))
     arrived = {} if found is None else found.arrived
     waited = decisive(context.protocol, context.protocol.step(step))

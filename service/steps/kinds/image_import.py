@@ -22,13 +22,13 @@ _KINDS = {"calibration": "board_image", "image": "image", "control_image": "cont
 
 
 class Params(StepParams):
-    """Which photographs of the import."""
+    """The photographs of the import that the step takes."""
 
     photographs: PhotographRole  # part of the import
 
 
 class Measures(MeasureRecord):
-    """Of the photographs that were imported."""
+    """The measures of the photographs that were imported."""
 
     images_imported: Annotated[Count, "photographs of the import"] = None
     raw_files: Annotated[Count, "raw files of the import"] = None
@@ -38,7 +38,7 @@ class Measures(MeasureRecord):
 
 
 class Result(Record):
-    """What was imported; the images themselves are in the events of the views."""
+    """The role and number of the imported photographs; the images themselves are in the events of the views."""
 
     photographs: str
     imported: int
@@ -120,7 +120,7 @@ def _put(context: StepContext, listed: ImportList, file: ImportedFile, kind: str
 
 
 class StatedSettings(BaseModel):
-    """The settings that a photograph states; 0 and None: not stated."""
+    """The settings in a photograph's EXIF; 0 and None: not given."""
 
     aperture_f: float | None = None
     exposure_s: float | None = None
@@ -128,9 +128,9 @@ class StatedSettings(BaseModel):
 
 
 def stated_settings_agree(stated: StatedSettings, wanted: CameraSection | None) -> bool | None:
-    """Whether aperture, exposure time and ISO of a photograph are those of the protocol, as in a capture.
+    """Return whether aperture, exposure time and ISO of a photograph are those of the protocol, as in a capture.
 
-    None if the protocol sets none, or the file states none of the three.
+    The answer is None if the protocol sets none, or the file gives none of the three.
     """
     if wanted is None:
         return None

@@ -37,12 +37,12 @@ _SIDES: tuple[tuple[str, str], ...] = (
 
 
 class Params(StepParams):
-    """How many photographs are taken, and how."""
+    """The number of photographs, and the way they are taken."""
 
     gives: ClassVar = "rough_spheres"
     repeated: ClassVar = RepeatedStep("Move the spheres as it says, then take another photograph")
 
-    photographs: int = 1  # in the first attempt; the camera is moved in between
+    photographs: int = 1  # the photographs in the first attempt; the camera is moved in between
     most_photographs: int = 5  # most of one layout, while the measures are not certain enough for a decision
     between_s: float = 5.0  # time for moving the camera
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for a photograph that arrives as a file
@@ -55,7 +55,7 @@ class Params(StepParams):
 
 
 class Measures(LayoutMeasures):
-    """Of the layout, and of the photographs that show it."""
+    """The measures of the layout, and of the photographs that show it."""
 
     spheres_seen: Annotated[Count, "spheres found in the photographs"] = None
     photographs_used: Annotated[Count, "photographs that the layout was judged from"] = None
@@ -102,7 +102,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _earlier(context: StepContext) -> list[layout.LayoutPhotograph]:
-    """The photographs of the present layout: those taken since a sphere was last moved."""
+    """Return the photographs of the present layout: those taken since a sphere was last moved."""
     images: list[layout.LayoutPhotograph] = []
     for note in context.state.notes:
         if note.note == MOVE_WANTED:
@@ -181,7 +181,7 @@ def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> No
 
 
 def _move_hand(move: layout.SphereMove) -> dict[str, object]:
-    """Tell the simulated technician where in the photograph the sphere is, as the screen tells a person."""
+    """Return an action that shows the simulated technician where in the photograph the sphere is."""
     return {
         "action": "move_sphere",
         "from": list(move.old_place),

@@ -47,7 +47,7 @@ from service.steps.registration_sources import (
 
 
 class StructureFromMotion(Record):
-    """How much effort structure from motion makes: more features and pairs take longer."""
+    """The effort of structure from motion: more features and pairs take longer."""
 
     max_image_size: int = 3200  # features are searched in images reduced to this longer side, px
     max_features: int = 8000  # features per image
@@ -55,7 +55,7 @@ class StructureFromMotion(Record):
 
 
 class Params(StepParams):
-    """Which images, which scan, which camera poses."""
+    """The images, the scan and the camera poses of the registrations."""
 
     gives: ClassVar = "registrations"
     repeated: ClassVar = RepeatedStep(
@@ -70,7 +70,7 @@ class Params(StepParams):
     # poses need no mount (spheres, colmap, glomap).
     hand_eye: Annotated[str | tuple[str, ...] | None, NAMES_CALIBRATION] = None
     scan: Annotated[str, NAMES_SCAN]  # step that imported the scan
-    poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
+    poses: tuple[Source, ...] = DEFAULT_SOURCES  # the sources of the camera poses; each gives a registration
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
     # The others search every image whole: "paper" is the published method without its networks, "grounded" has
     # Grounding DINO and SAM 2, and in "vote" it and the classical one must agree.
@@ -113,7 +113,7 @@ _CONSISTENCY = ("consistency_mm", "consistency_mrad")  # measures of the job tha
 
 
 class Measures(RegistrationMeasures[OneRegistration]):
-    """Of the outlines, and of every registration."""
+    """The measures of the outlines, and of every registration."""
 
     outlines: Annotated[Count, "outlines of spheres found in all images"] = None
     outlines_an_image: Annotated[Count, "outlines found in an image, on average"] = None
@@ -183,7 +183,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _search(context: StepContext, params: Params) -> JobRequest:
-    """The search for outlines; the jobs after it share most of its arguments."""
+    """Return the search for outlines; the jobs after it share most of its arguments."""
     images = captured_images(context, [*params.images_of, *params.control_images_of])
     if not posed(images) and not set(params.poses) <= {"colmap", "glomap"}:
         raise ConfigurationError(
@@ -227,7 +227,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
 
 
 def _mounting(context: StepContext, params: Params, images: list[PosedPhotograph]) -> CameraMounting:
-    """How the camera was mounted on the arm; empty where a person held it."""
+    """Return how the camera was mounted on the arm; empty where a person held it."""
     steps = (params.hand_eye,) if isinstance(params.hand_eye, str) else params.hand_eye or ()
     if not steps:
         return CameraMounting(Mounting(), {})
@@ -249,7 +249,7 @@ def _words(found: RegistrationJobs) -> str:
 
 
 def _outcome(found: RegistrationJobs) -> StepOutcome:
-    """The registrations so far, including any that arrived although the step did not wait for them."""
+    """Return the registrations so far, including any that arrived although the step did not wait for them."""
     done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
     outlines = next(job for task, job in done if task.request.kind == detect_spheres.KIND.name)
     registrations = {name: OneRegistration.read(job.measures) for name, job in found.arrived.items()}
@@ -264,7 +264,7 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
 
 
 def _tell_findings(context: StepContext, outcome: StepOutcome) -> None:
-    """Tell what contradicts in the inputs, once for registrations that show the same."""
+    """Report what contradicts in the inputs, once for registrations that show the same."""
     assert isinstance(outcome.result, Result)
     shown: dict[str, list[str]] = {}
     for name, record in outcome.result.registrations.items():
@@ -275,7 +275,7 @@ def _tell_findings(context: StepContext, outcome: StepOutcome) -> None:
 
 
 def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]) -> StepOutcome:
-    """The outcome with the poses of the further cameras, and the measures of the worst of them."""
+    """Return the outcome with the poses of the further cameras, and the measures of the worst of them."""
     if not located:
         return outcome
     measured = [job.measures for job in located.values()]

@@ -30,7 +30,7 @@ _NAMES_APPLICATION = NamesStep("applies a coat", lambda params: isinstance(param
 
 
 class Params(StepParams):
-    """What the scan must contain."""
+    """The contents that the scan must have, and where it comes from."""
 
     gives: ClassVar = "scan_surface"
     repeated: ClassVar = RepeatedStep("Scan again, export the scan, and import it")
@@ -50,7 +50,7 @@ class Params(StepParams):
 
 
 class Measures(SphereMeasures):
-    """Of the mesh as it was exported, and of the spheres in it."""
+    """The measures of the mesh as it was exported, and of the spheres in it."""
 
     scan_vertices: Annotated[Count, "vertices of the scan"] = None
     scan_faces: Annotated[Count, "faces of the scan"] = None
@@ -144,7 +144,7 @@ class _LeftOut:
         self._imported = {(ref.original_name, ref.size_bytes) for ref in kept}
 
     def look(self, exports: Sequence[ScanExport]) -> None:
-        """Tell of exports of which it was not told yet; a host whose clock was set back dates new ones before.
+        """Report exports that were not reported yet; a host whose clock was set back dates new ones before.
 
         Those that an earlier step of this run imported are where they belong.
         """
@@ -172,7 +172,7 @@ class _LeftOut:
 
 
 def _age(context: StepContext, application: str) -> dict[str, float]:
-    """The time since a coat was applied, and nothing if it cannot be told, with the reason; both clocks are noted."""
+    """Return the time since a coat was applied; nothing, with the reason, if it is unknown. Both clocks are noted."""
     applied = earlier_result(context, application, timed_application.Result).applied
     arrived = context.moment()
     age = elapsed(applied, arrived)
@@ -187,7 +187,7 @@ def _age(context: StepContext, application: str) -> dict[str, float]:
 
 
 def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) -> JobRequest:
-    """The search in the only mesh, or the merging of several and the search in what results."""
+    """Return the search in the only mesh, or the merging of several and the search in what results."""
     arguments, references = _arguments(context, params, meshes[0])
     if len(meshes) == 1:
         return JobRequest.of(locate_spheres.KIND, arguments, references)
@@ -204,7 +204,7 @@ def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) ->
 def _arguments(
     context: StepContext, params: Params, mesh: ArtefactRef
 ) -> tuple[locate_spheres.Arguments, dict[str, Reference | None]]:
-    """The arguments of the search, with the spheres to compare with, and the references to these."""
+    """Return the arguments of the search, with the spheres to compare with, and the references to these."""
     arguments = locate_spheres.Arguments(
         mesh=mesh.sha256, radius_m=metres(context.protocol.spheres.radius_mm), expected=params.spheres
     )

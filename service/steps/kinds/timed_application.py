@@ -16,21 +16,21 @@ from service.steps.measures import Count, MeasureRecord
 
 
 class Params(StepParams):
-    """What is applied and how long it lasts."""
+    """The product that is applied, and how long it lasts."""
 
     repeated: ClassVar = RepeatedStep(
         "Judge it again as it is; the time since the coating runs on", same=True, device=False, computes=False
     )
     needs_disk: ClassVar = False
 
-    product: str  # what is applied
+    product: str  # the product that is applied
     sublimates_after_s: float  # time until it has disappeared
     scan_within_s: float  # latest time of the scan after the application
     settle_s: float = 0.0  # waiting time before the next step
 
 
 class Measures(MeasureRecord):
-    """That the product was applied."""
+    """The fact that the product was applied."""
 
     applications: Annotated[Count, "times that the product was applied"] = None
 
@@ -44,11 +44,11 @@ class _Applied(BaseModel):
 
 
 class Result(Record):
-    """When the coating was applied, in both clocks of the host, and its times."""
+    """The time of the coating, in both clocks of the host, and its limits."""
 
     product: str
     applied_monotonic_s: float
-    applied_utc: str = ""  # ISO 8601; "" in a run of a version that kept the monotonic time alone
+    applied_utc: str = ""  # ISO 8601; "" in a run of a version that stored the monotonic time alone
     applied_boot: str = ""  # boot id of the host, in which the monotonic time counts
     scan_within_s: float
     sublimates_after_s: float
@@ -60,7 +60,7 @@ class Result(Record):
 
 
 def applied_at(notes: Sequence[Note]) -> Moment | None:
-    """When the product was applied, by the notes of such a step; None if it was not yet."""
+    """Return when the product was applied, by the notes of such a step; None if it was not yet."""
     for noted in notes:
         note = _Applied.model_validate(noted.data)
         if note.applied_monotonic_s is not None:

@@ -21,14 +21,14 @@ from service.steps.views import CaptureTask, CaptureTotals, capture_viewpoints
 
 
 class Params(MovingParams):
-    """Which viewpoints, what the images are for, and what is computed from them during the capture."""
+    """The viewpoints, the purpose of the images, and the numbers computed from them during the capture."""
 
     repeated: ClassVar = RepeatedStep("Take the views that are missing or would help; the others are kept")
 
-    purpose: Literal["dataset", "control"]  # what the images are for
-    viewpoints: tuple[ViewpointSet, ...]  # where the images are taken from
-    order: Order = "as_listed"  # of the viewpoints: as listed, or along the shortest way
-    live: LiveParams | None = None  # what is computed from each image during the capture; nothing if left out
+    purpose: Literal["dataset", "control"]  # the purpose of the images
+    viewpoints: tuple[ViewpointSet, ...]  # the viewpoints from which the images are taken
+    order: Order = "as_listed"  # the order of the viewpoints: as listed, or along the shortest way
+    live: LiveParams | None = None  # the numbers computed from each image during the capture; nothing if left out
 
     @property
     def needed_devices(self) -> tuple[NeededDevice, ...]:
@@ -42,7 +42,7 @@ class Params(MovingParams):
 
 
 class Measures(PredictedMeasures, CaptureMeasures):
-    """Of the capture, and of what its images are predicted to give."""
+    """The measures of the capture, and what its images are predicted to give."""
 
     images_spoilt: Annotated[
         Count, "images that are black, blurred or overexposed, and were so again when they were repeated"
@@ -57,7 +57,7 @@ class Measures(PredictedMeasures, CaptureMeasures):
 
 
 class Result(Record):
-    """What was captured; the images themselves are in the viewpoint events."""
+    """The purpose and number of the images; the images themselves are in the viewpoint events."""
 
     purpose: str
     captured: int
@@ -158,13 +158,13 @@ class _Capture:
         return totals, spoilt
 
     def of_images(self, images: Collection[str]) -> list[Viewpoint]:
-        """The viewpoints at which these images (SHA-256) were taken."""
+        """Return the viewpoints at which these images (SHA-256) were taken."""
         captures = self._context.evidence.captures(self._context.step.id)
         taken = {capture.viewpoint for capture in captures if capture.artefacts[0].sha256 in images}
         return [viewpoint for viewpoint in self.viewpoints if viewpoint.name in taken]
 
     def candidates(self) -> list[tuple[Viewpoint, float]]:
-        """Further viewpoints of the last station that the arm can reach, with the travel time (s)."""
+        """Return further viewpoints of the last station that the arm can reach, with the travel time (s)."""
         taken = {viewpoint.name for viewpoint in self.viewpoints}
         return feasible_extra(self._context, [v for v in self._extra if v.name not in taken], self._nominal)
 

@@ -21,7 +21,7 @@ _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
 
 def lbr_r820(name: str) -> ArmModel:
-    """An LBR with a reach of 820 mm, which is made for industry (iiwa) and for medical devices (Med).
+    """Return an LBR with a reach of 820 mm, which is made for industry (iiwa) and for medical devices (Med).
 
     Source: KUKA, specifications "LBR iiwa 7 R800, LBR iiwa 14 R820" and "LBR Med": dimensions, axis ranges, speeds.
     """
@@ -42,14 +42,14 @@ def lbr(
     speeds_deg_s: tuple[float, ...],
     payload_kg: float,
 ) -> ArmModel:
-    """An LBR.
+    """Return the model of an LBR.
 
     Args:
-        name: as the controller states it.
-        offsets_m: base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange.
+        name: the arm's name as the controller gives it.
+        offsets_m: the distances base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange.
         limits_deg: (7,) range of each joint to each side.
-        speeds_deg_s: (7,) of the joints.
-        payload_kg: on the flange.
+        speeds_deg_s: (7,) largest speeds of the joints.
+        payload_kg: the largest load on the flange.
     """
     base, upper, fore, hand = offsets_m
     return ArmModel(

@@ -1,4 +1,4 @@
-"""What all arms of Universal Robots have in common: the form of their DH table, their links, and what may touch."""
+"""What all arms of Universal Robots have in common: their DH table's layout, their links, and what may touch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ALLOWED = frozenset(
 # state no acceleration, and for some joints a little more speed: 180°/s, or 360°/s.
 _SPEED_RAD_S, _ACCELERATION_RAD_S2 = 3.14, 40.0
 _BRAKING_RAD_S2 = 4.0  # of a program that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
-# Spread of thirteen published factory calibrations, for a controller that lacks its own, and 0.1 mm for what these do
+# Spread of thirteen published factory calibrations, for a controller that has none, and 0.1 mm for what these do
 # not show; the zeros of the joints are right in all of them. Between forearm and wrist 1 the axes are turned by up to
 # 0.76°. Offsets 2 and 3 are along the same direction as 4, which stands for all three.
 _TOLERANCES = ArmTolerances(
@@ -43,17 +43,17 @@ def universal_robot(
     payload_kg: float,
     elbow_deg: float = 360.0,
 ) -> ArmModel:
-    """An arm of Universal Robots.
+    """Return the model of an arm of Universal Robots.
 
     The capsules are sized for the UR10e, and scaled by the wrist's offset for others.
 
     Args:
-        name: as the controller states it.
+        name: the arm's name as the controller gives it.
         a_m: lengths of upper arm and forearm, negative.
-        d_m: offsets 1, 4, 5 and 6.
-        speeds_deg_s: (6,) of the joints, as the data sheet states them.
-        payload_kg: on the flange.
-        elbow_deg: range of the elbow to each side; all others turn by 360°.
+        d_m: the offsets 1, 4, 5 and 6.
+        speeds_deg_s: (6,) largest speeds of the joints, as the data sheet gives them.
+        payload_kg: the largest load on the flange.
+        elbow_deg: the range of the elbow to each side; all others turn by 360°.
     """
     half = np.pi / 2
     limits_deg = np.array([360.0, 360.0, elbow_deg, 360.0, 360.0, 360.0])

@@ -12,7 +12,7 @@ Identified = Literal["", "claimed", "password", "pin", "badge"]
 
 
 class OperatorAction(Record):
-    """What a person did. `automatic` marks a confirmation given by --auto-confirm on a simulated rig."""
+    """A person's action. `automatic` marks a confirmation given by --auto-confirm on a simulated rig."""
 
     kind: Literal["operator_action"] = "operator_action"
     action: OperatorVerb
@@ -20,9 +20,9 @@ class OperatorAction(Record):
     viewpoint: str | None = None  # redo of a single viewpoint
     reason: str = ""
     checklist: tuple[str, ...] = ()  # items ticked
-    meaning: str = ""  # of a signature
+    meaning: str = ""  # the meaning of a signature
     signed_sha256: str = ""  # hash of the event that was signed
-    role: str = ""  # of the person, where the action demands one
+    role: str = ""  # the person's role, where the action demands one
     identified: Identified = ""
     via: Literal["cli", "web", "pedal", "auto"] = "cli"
     automatic: bool = False
@@ -52,11 +52,11 @@ class RobotSeen(Record):
 
     kind: Literal["robot_seen"] = "robot_seen"
     device: str  # name in rig.yaml
-    lost_seq: int = 0  # of the event that told of the loss; 0: the program had ended, which no event told yet
+    lost_seq: int = 0  # the event that reported the loss; 0: the program had ended, which no event had reported
 
 
 class ControlTaken(Record):
-    """From now on only one screen may act on the run; the others may only watch."""
+    """One screen took control of the run: from now on only it may act on the run; the others may only watch."""
 
     kind: Literal["control_taken"] = "control_taken"
     screen: str  # name of the sign-in whose screen it is; "" when control was given back
@@ -94,8 +94,8 @@ class RunReleased(Record):
 
     kind: Literal["run_released"] = "run_released"
     meaning: str
-    signed_sha256: str  # of the run_completed event
-    identified: Literal["", "claimed", "password"] = ""  # how the person was identified; "" in older records
+    signed_sha256: str  # the hash of the run_completed event
+    identified: Literal["", "claimed", "password"] = ""  # the way of identification; "" in older records
 
 
 class EvidenceExported(Record):
@@ -106,4 +106,4 @@ class EvidenceExported(Record):
     file_name: str
     sha256: str
     size_bytes: int
-    head_sha256: str  # of the chain when it was made
+    head_sha256: str  # the chain's hash when it was made

@@ -29,10 +29,10 @@ class RunStarted(Record):
 
 
 class HostClock(Record):
-    """How well the host's clock is set; None stands for not known."""
+    """The host clock's synchronisation; None stands for not known."""
 
     source: Literal["chrony", "kernel", ""]
-    synchronised: bool | None  # with the network's time
+    synchronised: bool | None  # true if synchronised with the network's time
     offset_s: float | None  # host minus network
     error_s: float | None = None  # the kernel's bound on the error
 
@@ -72,10 +72,10 @@ class LeaveLapsed(Record):
     """A person's confirmation that the robot may move is over: nothing visible came of it for too long."""
 
     kind: Literal["leave_lapsed"] = "leave_lapsed"
-    leave_seq: int  # of the event that gave it
+    leave_seq: int  # the event that gave it
     idle_s: float  # without visible progress since then, or since the last progress
-    limit_s: float  # of the protocol: motion.confirmed_for_s
-    why: str = ""  # what the run had waited for, in words; "" if it is not known
+    limit_s: float  # the protocol's limit: motion.confirmed_for_s
+    why: str = ""  # the thing that the run had waited for; "" if it is not known
 
 
 class RunCompleted(Record):
@@ -101,7 +101,7 @@ class StepStarted(Record):
 
 
 class StepNote(Record):
-    """Something a step found out that belongs in the record (station entered, timer started, …)."""
+    """A finding of a step that belongs in the record (station entered, timer started, …)."""
 
     kind: Literal["step_note"] = "step_note"
     step: str
@@ -122,7 +122,7 @@ class FilesKept(Record):
 
 
 class Uncertainty(Record):
-    """How well a measured number is known, in the number's own unit."""
+    """The uncertainty of a measured number, in the number's own unit."""
 
     sigma: float  # standard deviation
     lower: float  # the true value is above this with 99 % confidence (one-sided)
@@ -133,7 +133,7 @@ class ComputedBy(Record):
     """A job whose measures, and whose answer, a step gave as its own."""
 
     job: str
-    prefix: str = ""  # what the step put before the names of the job's measures: `colmap_`
+    prefix: str = ""  # the text that the step put before the names of the job's measures: `colmap_`
 
 
 class StepMeasured(Record):
@@ -145,7 +145,7 @@ class StepMeasured(Record):
     measures: dict[str, float]
     artefacts: tuple[ArtefactRef, ...] = ()
     result: dict[str, Any] = Field(default_factory=dict)  # the step kind's Result as plain data
-    uncertainties: dict[str, Uncertainty] = Field(default_factory=dict)  # of those measures that state one
+    uncertainties: dict[str, Uncertainty] = Field(default_factory=dict)  # those of the measures that have one
     computed_by: tuple[ComputedBy, ...] | None = None  # None: recorded before events named the jobs
 
 
@@ -178,7 +178,7 @@ class GateVerdict(Record):
     maximum: float | None
     unit: str
     passed: bool
-    sigma: float | None = None  # of the value, where it states its uncertainty
+    sigma: float | None = None  # the value's standard deviation, where it is known
     lower: float | None = None
     upper: float | None = None
     undecided: bool = False  # a limit lies between the bounds; `passed` is then false
@@ -206,12 +206,12 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metr
 
 
 class RecordedView(Record):
-    """What the record holds for every photograph, whether taken by robot, by hand or imported."""
+    """The record of every photograph, whether taken by robot, by hand or imported."""
 
     step: str
     attempt: int
     viewpoint: str  # name of the view, unique within its step
-    station: str  # of the robot; "" without one
+    station: str  # the robot's station; "" without one
     artefacts: tuple[ArtefactRef, ...]  # the photograph first
     camera: dict[str, Any]  # EXIF settings, counter, time, lens
     environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
@@ -219,7 +219,7 @@ class RecordedView(Record):
 
 
 class FurtherExposure(Record):
-    """What a further camera exposed at the same viewpoint, after the first one."""
+    """The exposure of a further camera at the same viewpoint, after the first one."""
 
     device: str  # name in rig.yaml
     mounted: Literal["fixed", "rigid"]  # in the room, or beside the first camera
@@ -237,16 +237,16 @@ class ViewpointCaptured(RecordedView):
     kind: Literal["viewpoint_captured"] = "viewpoint_captured"
     T_base_flange: Matrix4  # mean over the exposure
     pose_sigma_m: float  # standard deviation of the position over the exposure
-    pose_sigma_rad: float  # of the rotation vector; early runs recorded that of its length, which is smaller
+    pose_sigma_rad: float  # 1σ of the rotation vector; early runs recorded that of its length, which is smaller
     joints_rad: tuple[float, ...]
     pose_samples: int
     trigger_monotonic_s: float
     arrival_monotonic_s: float
     controller_time_s: float
     clock_offset_s: float  # controller time minus host monotonic
-    further: tuple[FurtherExposure, ...] = ()  # of the rig's further cameras that exposed here
-    ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
-    T_flange_tcp: Matrix4 | None = None  # the tool that the controller held; None: it did not tell
+    further: tuple[FurtherExposure, ...] = ()  # the exposures of the rig's further cameras here
+    ringing_s: float = 0.0  # the time for which the arm swung after the commanded motion; a loose mount shows here
+    T_flange_tcp: Matrix4 | None = None  # the tool that the controller held; None: it did not report it
     payload_kg: float | None = None  # that the controller reckoned with
     payload_centre_m: tuple[float, float, float] | None = None  # its centre of gravity in the flange frame
 

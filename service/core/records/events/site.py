@@ -30,7 +30,7 @@ class ServiceStarted(Record):
     boot: str  # boot id, "" where the system has none
     clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: not known
     heads: dict[str, tuple[int, str]]  # run → number and hash of its last event, where it grew since the last start
-    unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
+    unsigned_runs: tuple[str, ...]  # the runs with events after their last checkpoint
     open_runs: tuple[str, ...]
 
 
@@ -43,7 +43,7 @@ class AccountChanged(Record):
     old: str
     new: str
     reason: str = ""
-    full_name: str = ""  # of a new account
+    full_name: str = ""  # the full name of a new account's holder
     # password_hash, pin_hash, badge_hash, token_sha256 → its SHA-256, which shows a secret not set by the software.
     stored: dict[str, str] = Field(default_factory=dict)
 
@@ -56,7 +56,7 @@ class SignInRecorded(Record):
     outcome: Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
     screen: str = ""
     address: str = ""
-    session_sha256: str = ""  # of the stored session, which shows one not made by the software
+    session_sha256: str = ""  # the hash of the stored session, which shows one not made by the software
 
 
 class KeyChanged(Record):
@@ -82,7 +82,7 @@ class RunSigned(Record):
     kind: Literal["run_signed"] = "run_signed"
     run: str
     seq: int
-    sha256: str  # of that event
+    sha256: str  # the hash of that event
 
 
 class SignaturesWrittenAgain(Record):
@@ -92,7 +92,7 @@ class SignaturesWrittenAgain(Record):
     lines: int
     runs: tuple[str, ...]  # whose signatures these were, or the site's
     since_utc: str  # time of the first of them
-    explained: bool  # whether one interrupted signature, as by a power failure, explains it
+    explained: bool  # true if one interrupted signature, as by a power failure, explains it
 
 
 class TimeStampKept(Record):
@@ -100,10 +100,10 @@ class TimeStampKept(Record):
 
     kind: Literal["time_stamp_kept"] = "time_stamp_kept"
     run: str
-    seq: int  # of the checkpoint
+    seq: int  # the checkpoint's event
     authority: str
-    at_utc: str  # when it was asked
-    token_sha256: str  # of the token's text
+    at_utc: str  # the time of the request
+    token_sha256: str  # the hash of the token's text
 
 
 class ActionAfterEnd(Record):
@@ -134,18 +134,18 @@ class DataRestored(Record):
 
     kind: Literal["data_restored"] = "data_restored"
     state: str  # name of the backup's state
-    at_utc: str  # when the backup was made
+    at_utc: str  # the time of the backup
     folder: str  # the data folder that was backed up
     host: str
 
 
 class RecordRebuilt(Record):
-    """Database or journal was overwritten, cut or lost, and was made again from the other; the old files are kept."""
+    """Database or journal was overwritten, cut or lost, and was made again from the other; the old files remain."""
 
     kind: Literal["record_rebuilt"] = "record_rebuilt"
-    made: Literal["database", "journal"]  # what was made again
-    why: str  # what was found
-    events: int  # in all chains, when this was done
-    restored_events: int  # of these, which the old database did not hold any more
+    made: Literal["database", "journal"]  # the part that was made again
+    why: str  # the damage that was found
+    events: int  # the number of events in all chains, when this was done
+    restored_events: int  # the number of these that the old database did not hold any more
     kept: tuple[str, ...]  # files of the data folder that hold what was there before
-    lost: tuple[str, ...] = ()  # what could not be restored, in words; () if nothing is known to be lost
+    lost: tuple[str, ...] = ()  # descriptions of what could not be restored; () if nothing is known to be lost
