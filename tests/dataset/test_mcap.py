@@ -104,6 +104,17 @@ def test_rosbags_opens_the_folder_as_a_recording_of_ros(bag: Path, dataset: Data
     assert described["duration"]["nanoseconds"] == images[-1][0] - images[0][0]
 
 
+def test_the_recording_says_of_which_run_it_is_and_whether_that_was_simulated(bag: Path, dataset: DataSet) -> None:
+    with (bag / "data_set.mcap").open("rb") as file:
+        (about,) = make_reader(file).iter_metadata()
+    assert about.name == "orthocapture"
+    assert about.metadata == {
+        "run": str(dataset.statement.get("run", "")),
+        "frame": "world is the frame of mesh.ply, in metres",
+        "simulated": "true" if dataset.simulated else "false",
+    }
+
+
 def test_photographs_without_times_are_a_second_apart(dataset: DataSet, tmp_path: Path) -> None:
     first, *others = dataset.views
     untimed = dataclasses.replace(dataset, views=(dataclasses.replace(first, taken=""), *others))
