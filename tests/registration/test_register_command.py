@@ -257,7 +257,7 @@ def test_a_displaced_control_sphere_is_measured_told_and_not_passed(
     assert all(one["finding"] == "" for one in others)
     said = " ".join(result.output.split())
     assert "Control sphere 0 is" in said
-    assert "outside its limit: worst_control_sphere_mm" in said
+    assert "outside its limit: Radial error of the worst control sphere" in said
     assert "not passed written:" in said
     # The covariance that the calibration states is counted.
     assert record["components_mm"]["intrinsics"] > 0
