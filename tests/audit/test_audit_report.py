@@ -215,7 +215,7 @@ def test_a_camera_has_one_serial_number_and_clocks_are_explained(tmp_path: Path)
 def test_counts_are_in_the_singular_where_there_is_one(tmp_path: Path) -> None:
     record_reported_run(tmp_path)
     html = words_of(render_html(report_of(tmp_path / "data")))
-    assert "3 photographs taken: 2 count, 1 was replaced by later ones; 1 exposure failed" in html
+    assert "3 photographs taken: 2 in use, 1 replaced by later ones; 1 exposure failed" in html
     assert not re.findall(
         r"\b(?<![\d.,])1 (?:deviations|faults|events|views|images|photographs|exposures|jobs)\b", html
     )

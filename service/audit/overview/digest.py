@@ -241,12 +241,12 @@ class Shots:
 
     @property
     def words(self) -> str:
-        """`57 photographs taken: 54 count, 3 were replaced by later ones; 2 exposures failed`."""
+        """`57 photographs taken: 54 in use, 3 replaced by later ones; 2 exposures failed`."""
         if not self.taken and not self.failed:
             return "no photograph taken"
-        parts = [f"{self.count} count" if self.count != 1 else "1 counts"]
+        parts = [f"{self.count} in use"]
         if self.replaced:
-            parts.append(f"{self.replaced} {'was' if self.replaced == 1 else 'were'} replaced by later ones")
+            parts.append(f"{self.replaced} replaced by later ones")
         told = f"{counted(self.taken, 'photograph')} taken: {', '.join(parts)}"
         return told + (f"; {counted(self.failed, 'exposure')} failed" if self.failed else "")
 
