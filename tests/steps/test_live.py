@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,6 @@ def test_clipped_pixels_are_counted_whichever_channel_clips() -> None:
     assert clipped_fraction(image) == pytest.approx(0.375)
 
 
-@pytest.mark.slow
 def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     known, views = None, list[LiveView]()
@@ -471,3 +470,33 @@ def test_an_operator_is_told_what_is_missing_and_what_would_help(begin: Callable
     bench.rig.arm.on_move = suggest
     bench.script("capture", "recovery", told)
     assert bench.run().status == "aborted"
+
+
+@pytest.mark.slow
+def test_an_image_that_is_judged_late_is_taken_again_and_one_that_is_spoilt_again_is_not(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5, gates=UNEXAMINED)
+    compute, usual = bench.operator.on_show, HANDLERS["live_view"]
+    looked_at: list[str] = []
+
+    def look(context: RecordedContext) -> JobAnswer:
+        """Judge both images of v001 black, and the first of v003."""
+        answer = usual(context)
+        name = live_view.KIND.read_arguments(context.arguments).image.viewpoint
+        looked_at.append(name)
+        black = name == "v001" or (name == "v003" and looked_at.count(name) == 1)
+        return replace(answer, answer=answer.answer.model_copy(update={"black": black}))
+
+    def at_first_only_two_images(what: str) -> None:
+        late = "live_numbers_late" in [note.note for note in bench.payloads(StepNote)]
+        if len(bench.captured()) < 3 or late:
+            compute(what)
+
+    monkeypatch.setitem(HANDLERS, "live_view", look)
+    bench.operator.on_show = at_first_only_two_images
+    assert bench.run().status == "completed"
+    taken = bench.captured()[1:]
+    assert taken == ["v001", "v002", "v003", "v004", "v001", "v003"]
+    announced = [line for line in bench.operator.told if "taken again" in line]
+    assert [line.partition(":")[0] for line in announced] == ["v001", "v003"]

@@ -145,15 +145,18 @@ class _Capture:
         repeated: set[str] = set()
         while True:
             spoilt = live.spoilt()
-            due = [viewpoint for viewpoint in self.of_images(spoilt) if viewpoint.name not in repeated]
+            captures = self._context.evidence.captures(self._context.step.id)
+            due = {
+                capture.artefacts[0].sha256: capture.viewpoint
+                for capture in captures
+                if capture.artefacts[0].sha256 in spoilt and capture.viewpoint not in repeated
+            }
             if not due:
                 break
-            repeated |= {viewpoint.name for viewpoint in due}
-            for capture in self._context.evidence.captures(self._context.step.id):
-                why = spoilt.get(capture.artefacts[0].sha256)
-                if why is not None and capture.viewpoint in repeated:
-                    self._context.tell(f"{capture.viewpoint}: {why}; it is taken again")
-            totals = replace(self.take(self._planned(due), spoilt), given_up=totals.given_up)
+            for sha256, viewpoint in due.items():
+                self._context.tell(f"{viewpoint}: {spoilt[sha256]}; it is taken again")
+            repeated |= set(due.values())
+            totals = replace(self.take(self._planned(self.of_images(due)), due), given_up=totals.given_up)
         live.note_spoilt(spoilt)
         return totals, spoilt
 
