@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -60,8 +59,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(CpuRecord(directory / f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.jsonl"))
     limit_s: float | None = config.getoption("--cpu-below")
     if limit_s is not None:
-        costs = json.loads((Path(__file__).parent / "cpu_seconds.json").read_text(encoding="utf-8"))
-        config.pluginmanager.register(CostLimit(limit_s, costs))
+        config.pluginmanager.register(CostLimit(limit_s, collecting.listed_costs()))
     seed: str | None = config.getoption("--draw")
     if seed is not None:
         config.pluginmanager.register(Draw(seed))

@@ -294,7 +294,8 @@ class _CaptureLoop:
         if sent_rad is not None:
             self._require_there(robot, self.context.devices.layout(first.station).robot, here_rad, sent_rad)
         unchecked = first.from_rad is None  # the arm's kinematics are not known
-        if first.name in self._planned and (unchecked or _begins(first, here_rad) or _ends(first, here_rad)):
+        at_an_end = _stands(first.from_rad, here_rad) or _stands(first.joints_rad, here_rad)
+        if first.name in self._planned and (unchecked or at_an_end):
             return todo
         plan = self.task.plan_anew(todo)
         self._follow(plan)
@@ -325,7 +326,7 @@ class _CaptureLoop:
             return settled
 
         self._stands_rad.pop(viewpoint.station, None)  # a motion that is cut short ends anywhere
-        if not _ends(viewpoint, robot.state().sample.joints_rad):
+        if len(viewpoint.way_rad) and not _stands(viewpoint.joints_rad, robot.state().sample.joints_rad):
             for joints_rad in viewpoint.way_rad[1:]:
                 move(joints_rad)
         settled = move(target)
@@ -376,14 +377,9 @@ class _CaptureLoop:
         )
 
 
-def _begins(viewpoint: Viewpoint, joints_rad: Array) -> bool:
-    """Return whether the arm stands where the way to a viewpoint begins."""
-    return viewpoint.from_rad is not None and bool(np.abs(joints_rad - viewpoint.from_rad).max() <= _BEGINS_RAD)
-
-
-def _ends(viewpoint: Viewpoint, joints_rad: Array) -> bool:
-    """Return whether the arm stands at a planned viewpoint already."""
-    return viewpoint.joints_rad is not None and bool(np.abs(joints_rad - viewpoint.joints_rad).max() <= _BEGINS_RAD)
+def _stands(at_rad: Array | None, joints_rad: Array) -> bool:
+    """Return whether an arm with these joints (N,) stands at an end of a planned way; False if none was planned."""
+    return at_rad is not None and bool(np.abs(joints_rad - at_rad).max() <= _BEGINS_RAD)
 
 
 def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:

@@ -44,8 +44,7 @@ def require_own_mount(folder: Path) -> None:
     Raises:
         StoreError: the file system is shared between machines, or it has no working locks.
     """
-    why = why_unsafe(folder)
-    if why and not os.environ.get(ALLOW):
+    if not os.environ.get(ALLOW) and (why := why_unsafe(folder)):
         raise StoreError(
             f"the data folder is {why}: a database in it loses data when two machines write",
             where=str(folder),

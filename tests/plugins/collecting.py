@@ -84,6 +84,16 @@ def listed_costs() -> Costs:
     return json.loads(listed.read_text()) if listed.exists() else {}
 
 
+def listed_name(test: str) -> tuple[str, str]:
+    """Return the file of a test and its name as the list of costs has them, without the row of a parametrised test.
+
+    >>> listed_name("tests/test_a.py::TestB::test_c[row-1]")
+    ('tests/test_a.py', 'TestB::test_c')
+    """
+    file, _, name = test.partition("[")[0].partition("::")
+    return file, name
+
+
 def dearest_first(tests: Sequence[str], costs: Costs) -> list[int]:
     """Return the order of tests with the dearest files first, so that none keeps one process busy at the end.
 
@@ -93,7 +103,7 @@ def dearest_first(tests: Sequence[str], costs: Costs) -> list[int]:
     places: list[str] = []
     cost_s: dict[str, float] = defaultdict(float)
     for test in tests:
-        file, _, name = test.partition("[")[0].partition("::")
+        file, name = listed_name(test)
         places.append(_BROWSER if file.startswith(_BROWSER) else file)
         cost_s[places[-1]] += costs.get(file, {}).get(name, _UNKNOWN_S)
     return sorted(range(len(tests)), key=lambda k: -cost_s[places[k]])

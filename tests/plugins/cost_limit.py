@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.plugins.collecting import Costs
+from tests.plugins.collecting import Costs, listed_name
 
 
 class CostLimit:
@@ -23,6 +23,5 @@ class CostLimit:
         items[:] = [item for item in items if self._cost_s(item) < self._limit_s]
 
     def _cost_s(self, item: pytest.Item) -> float:
-        file, *inside = item.nodeid.split("::")
-        name = "::".join(part.partition("[")[0] for part in inside)
+        file, name = listed_name(item.nodeid)
         return self._costs.get(file, {}).get(name, 0.0)

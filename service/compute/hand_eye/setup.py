@@ -135,6 +135,14 @@ class RobustStart:
         """Return (N, 4, 4) T_base_board from each view alone."""
         return hands @ self.T_flange_camera @ scaled(boards, self.scale)
 
+    def deviation_mm(self, hands: Array, boards: Array) -> Array:
+        """Return (N,) how far each view places the board from its place, as lengths on the board as it was given.
+
+        They are relative to the scale, which must be positive: a board of no size fits everywhere.
+        """
+        mm, _ = deviation(self.placed(hands, boards), self.T_base_board)
+        return mm / max(self.scale, 1e-9)
+
 
 def scaled(boards: Array, scale: float) -> Array:
     """Return board poses (N, 4, 4) as if the board were `scale` times as large as they were computed for."""
@@ -170,12 +178,12 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> Robus
     """Return the answer of the subset of views that fits half of all views best.
 
     Least median of squares over random subsets (Rousseeuw 1984) and all views, so that a few wrong poses have no
-    influence.
+    influence. Its scale is positive.
     """
     n = len(hands)
     picks = [np.arange(n)]
     picks += [rng.choice(n, min(_SUBSET_SIZE, n), replace=False) for _ in range(_SUBSETS if n > _SUBSET_SIZE else 0)]
-    best: tuple[float, Array, RobustStart] | None = None
+    best: tuple[Array, RobustStart] | None = None
     for pick in picks:
         try:
             found = solve_with_scale(hands[pick], boards[pick])
@@ -183,22 +191,20 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> Robus
             continue
         if found.scale <= 0:  # no board has a negative size
             continue
-        placed = found.placed(hands, boards)
-        mm, _ = deviation(placed, mean_pose(placed[pick]))
-        median = float(np.median(mm)) / max(found.scale, 1e-9)  # a board of no size fits everywhere
-        if best is None or median < best[0]:
-            best = (median, mm, found)
+        off_mm = found.deviation_mm(hands, boards)
+        if best is None or np.median(off_mm) < np.median(best[0]):
+            best = (off_mm, found)
     if best is None:
         raise ComputeError("hand-eye calibration has no answer", remedy="Take views with more rotation")
-    keep = np.argsort(best[1], kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
+    off_mm, start = best
+    keep = np.argsort(off_mm, kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
     try:
         refined = solve_with_scale(hands[keep], boards[keep])
     except (cv2.error, ComputeError):
-        return best[2]
+        return start
     # Of few views of an arm that errs, the one left out may be the only one that was turned far.
-    mm, _ = deviation(refined.placed(hands, boards), refined.T_base_board)
-    spoilt = refined.scale <= 0 or float(np.median(mm)) / refined.scale > _SPOILT * best[0]
-    return best[2] if spoilt else refined
+    spoilt = refined.scale <= 0 or np.median(refined.deviation_mm(hands, boards)) > _SPOILT * np.median(off_mm)
+    return start if spoilt else refined
 
 
 def mean_pose(poses: Array) -> Transform:
@@ -439,8 +445,6 @@ def _fit(hands: Array, boards: Array, point_m: Array) -> SetupFit:
     try:
         found = robust_start(hands, boards, np.random.default_rng(0))
     except ComputeError:
-        return SetupFit(float("inf"), float("inf"), 1.0)
-    if found.scale <= 0:  # no board has a negative size
         return SetupFit(float("inf"), float("inf"), 1.0)
     mm, deg = deviation(found.placed(hands, boards), found.T_base_board, point_m)
     return SetupFit(float(np.median(mm)) / found.scale, float(np.median(deg)), found.scale)

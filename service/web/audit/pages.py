@@ -98,8 +98,8 @@ def gates_of(digest: Digest) -> list[StepGates]:
 def _explained(protocol: Protocol, step: Step, now: StepState, skipped: frozenset[str]) -> tuple[GateLine, ...]:
     """Return the gates of a step; where the protocol gives no reason for a limit, what its measure means."""
     kind = step_kinds().get(step.kind)
-    measures = {} if kind is None else kind.measures.declared()
-    measures |= measures_of(step, {known.id: known for known in protocol.steps}) or {}
+    declared = {} if kind is None else kind.measures.declared()
+    measures = measures_of(step, {known.id: known for known in protocol.steps}) or declared
     meanings = {name: sentence(measure.meaning) for name, measure in measures.items() if measure.meaning}
     lines = zip(step.gates, gate_lines(step, now, skipped), strict=True)
     return tuple(replace(line, why=line.why or meanings.get(gate.measure, "")) for gate, line in lines)
