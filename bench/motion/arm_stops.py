@@ -178,9 +178,9 @@ def measure_ur(config: UrConfig, model: str, speed_rad_s: float, how: signal.Sig
         Lateness() as lateness,
     ):
         arm.wait_moving(0.99 * speed_rad_s)
-        since_s = time.monotonic()
+        since, since_s = arm.mark(), time.monotonic()
         program.send(("driver", how))
-        arm.wait_stopped()
+        arm.wait_stopped(since)
         steps = [Step(one.at_s, one.time_s, one.speed_rad_s) for one in arm.samples()]
         return moved_on_s(steps, since_s, _UR_UNSCHEDULED_S), lateness.worst_s
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -164,23 +164,21 @@ def crowded(pid: int, rivals: int = 4) -> Generator[None]:
 @pytest.mark.realtime
 def test_a_call_that_waits_for_a_processor_is_given_that_time_besides() -> None:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=1.5, name="squeezed")
-    with crowded(int(device.open().serial)):
+    with closing(device), crowded(int(device.open().serial)):
         began_s = time.monotonic()
         device.burn(1.1)
         assert time.monotonic() - began_s > 1.5, "the machine was not crowded"
-    device.close()
 
 
 @pytest.mark.slow
 @pytest.mark.realtime
 def test_a_call_that_has_waited_long_enough_for_a_processor_names_the_machine() -> None:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=0.5, name="squeezed")
-    with crowded(int(device.open().serial)):
+    with closing(device), crowded(int(device.open().serial)):
         began_s = time.monotonic()
         with pytest.raises(MachineBusyError, match="waited for a processor or for memory"):
             device.burn(20.0)
         assert time.monotonic() - began_s < 30.0
-    device.close()
 
 
 def test_a_process_that_cannot_be_started_is_the_machines_fault(monkeypatch: pytest.MonkeyPatch) -> None:

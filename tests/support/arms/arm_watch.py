@@ -59,9 +59,15 @@ class ArmWatch:
     def wait_resting(self) -> None:
         until(lambda: self.now.speed_rad_s == 0.0, "it rests", every_s=0.01)
 
-    def wait_stopped(self) -> None:
-        """Wait until the arm rests and the controller runs no program that could move it."""
-        until(lambda: self.now.speed_rad_s == 0.0 and not self.now.program_runs, "it is stopped", every_s=0.01)
+    def wait_stopped(self, since: int) -> None:
+        """Wait until the arm rests and the program that moved it has ended since a mark.
+
+        A driver that is opened again at once may have sent the next one before this is looked at.
+        """
+        until(
+            lambda: self.now.speed_rad_s == 0.0 and not all(seen.program_runs for seen in self._seen[since:]),
+            "it is stopped", every_s=0.01,
+        )  # fmt: skip
 
     def pass_s(self, seconds: float) -> None:
         """Let so much time of the controller pass."""

@@ -17,6 +17,8 @@ from pydantic import BaseModel
 
 from tests.support.processes.forked import Forked
 
+_ENDED: dict[str, Any] = {}  # follows the last line
+
 
 class Program:
     """tests.support.processes.stubborn_program as a process.
@@ -46,7 +48,12 @@ class Program:
         self._lines: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.driver = int(self.next("driver")["driver"])
+        self.driver = 0
+        try:
+            self.driver = int(self.next("driver")["driver"])
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def pid(self) -> int:
@@ -64,16 +71,25 @@ class Program:
             os.kill(self.driver if to == "driver" else self.pid, which)
 
     def next(self, key: str, within_s: float = 120.0) -> dict[str, Any]:
-        """The next line with this key."""
+        """Return the next line with this key; fail, with the lines that came instead, if none comes in time."""
         deadline_s = time.monotonic() + within_s
+        others: list[dict[str, Any]] = []
         while True:
-            line = self._lines.get(timeout=max(0.01, deadline_s - time.monotonic()))
+            try:
+                line = self._lines.get(timeout=max(0.01, deadline_s - time.monotonic()))
+            except queue.Empty:
+                raise AssertionError(f"the program has not said {key!r}, but: {others}") from None
             if key in line:
                 return line
+            if line == _ENDED:
+                raise AssertionError(f"the program ended before it said {key!r}; it said: {others}")
+            others.append(line)
 
     def close(self) -> None:
+        """End the program; its driver, if it was stopped, runs on and ends by itself."""
         with contextlib.suppress(ProcessLookupError):
-            os.kill(self.driver, signal.SIGCONT)
+            if self.driver:
+                os.kill(self.driver, signal.SIGCONT)
         self._process.kill()
         self._process.wait(90)
         self._reader.join(90)
@@ -86,3 +102,4 @@ class Program:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             self._lines.put(json.loads(line))
+        self._lines.put(_ENDED)

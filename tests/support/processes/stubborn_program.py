@@ -30,7 +30,8 @@ def main() -> None:
     *goals_rad, speed_rad_s, acceleration_rad_s2 = map(float, numbers)
     hangs = how == "hangs"
     arm = hosted(RobotArm, spec, config, call_timeout_s=60, name="robot")
-    arm.open()
+    while not _opened(arm):
+        time.sleep(0.1)
     persons: list[tuple[str, float]] = []
     threading.Thread(target=_listen, args=(persons,), daemon=True).start()
     device: HostedDevice = vars(arm)["hosted_device"]
@@ -60,14 +61,16 @@ def main() -> None:
                 say(error=said, message=str(error), driver=device.pid)
             time.sleep(0.1)
             if isinstance(error, DeviceUnavailableError):
-                _reopen(arm)
+                _opened(arm)
 
 
-def _reopen(arm: RobotArm) -> None:
+def _opened(arm: RobotArm) -> bool:
     try:
         arm.open()
     except DeviceError as error:
-        say(reopening=str(error))
+        say(opening=str(error))
+        return False
+    return True
 
 
 def _listen(persons: list[tuple[str, float]]) -> None:
