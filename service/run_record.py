@@ -10,6 +10,8 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Literal
 
+from service.computations import term
+from service.computations.memory_grants import waiting_for_memory
 from service.core.errors import ComputeError, IntegrityError
 from service.core.jobs import arguments_name, job_key
 from service.core.protocol.models import Protocol, parse_protocol
@@ -17,8 +19,6 @@ from service.core.records.events import ArtefactRef, Event, Payload, RecordedVie
 from service.core.run.decide import advance, fold
 from service.core.run.state import JobState, RunState, lane_of
 from service.core.text.words import time_here
-from service.jobs import term
-from service.jobs.memory_grants import waiting_for_memory
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
 from service.store.database.engine import RESTORE

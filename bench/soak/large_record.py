@@ -16,10 +16,10 @@ import numpy as np
 
 from bench.soak.fit import Duration
 from bench.soak.sparse import SparseFiles, sparse_photograph
+from service.computations import live_view
+from service.computations.records import Camera, Limits, PosedPhotograph
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import ViewpointCaptured
-from service.jobs import live_view
-from service.jobs.records import Camera, Limits, PosedPhotograph
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

@@ -19,13 +19,13 @@ import httpx
 from typer.testing import CliRunner
 
 from service.cli.main import app
+from service.computations.job import JobAnswer, RecordedContext
 from service.core.errors import OrthocaptureError
 from service.core.records.events import StepNote
 from service.logs.file_log import file_log
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker import loop
-from service.worker.job import JobAnswer, RecordedContext
 from tests.support.runs.bench_run import Bench, HastyClock
 
 KIND = "coverage_points"  # a job kind from which no page reads anything

@@ -4,8 +4,8 @@ Run: python -m bench.whole_runs.image_job_memory [--jobs develop …] [--parts 3
 
 Each job is computed in a process of its own, with the allocator set as a worker sets it. Its memory is looked at ten
 times a second: the resident memory of the process and of those that it starts, as the worker counts it when it admits
-jobs (service/jobs/memory_grants.py). Inputs are made once, and kept: photographs with edges in every direction as a
-simulated Sony writes them, and scans of the simulated scene with a million faces each. Figures go to
+jobs (service/computations/memory_grants.py). Inputs are made once, and kept: photographs with edges in every
+direction as a simulated Sony writes them, and scans of the simulated scene with a million faces each. Figures go to
 bench/results/image_job_memory-DATE, beside what each kind of job states.
 """
 
@@ -30,12 +30,12 @@ import psutil
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.job_memory import RADIUS_M, SCENE, Folder
+from service.computations import develop, features, match, merge_scans
+from service.computations.job import JobContext, RecordedContext, handler_of
+from service.computations.kind import JobKind
 from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.resources import keep_freed_memory
 from service.core.units import megabytes
-from service.jobs import develop, features, match, merge_scans
-from service.jobs.kind import JobKind
-from service.worker.job import JobContext, RecordedContext, handler_of
 from simulators.rendering.sensor import bordered, camera_picture, read_out
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import Scene

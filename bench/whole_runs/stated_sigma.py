@@ -20,6 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
 from service.cli.demo import true_cameras
+from service.computations import register as job
+from service.computations.conversion import camera_used, lens_covariance
+from service.computations.detect_spheres.compute import read_outlines
+from service.computations.inputs import robot_camera_poses
 from service.compute.camera_model import CameraModel
 from service.compute.pipeline import register_images
 from service.compute.registration.cost import RegistrationSettings
@@ -29,12 +33,8 @@ from service.core.geometry import Array, apply, inverse, skew
 from service.core.jobs import jobs_of
 from service.core.units import mm
 from service.dataset.summary import RunSummary, summarise
-from service.jobs import register as job
 from service.run_start import recorded_run
 from service.store.store import Store
-from service.worker.inputs import robot_camera_poses
-from service.worker.outlines import read_outlines
-from service.worker.records import camera_used, lens_covariance
 
 _LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _MOST_OFF_PX = 2.0  # of an outline's axis from where its sphere is

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pydantic import BaseModel
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
-from service.jobs import job_kinds
-from service.jobs.kind import JobRecord
+from service.computations import job_kinds
+from service.computations.kind import JobRecord
 
 _HEAD = """\
 Made from the code by `make reference`.
 
-A job is one computation of a worker. Each kind is declared in one file of `service/jobs`, or in a plug-in (entry
-points `orthocapture.jobs`). What a job took from an earlier one stands in its arguments as a reference,
+A job is one computation of a worker. Each kind is declared in one folder of `service/computations`, or in a plug-in
+(entry points `orthocapture.jobs`). What a job took from an earlier one stands in its arguments as a reference,
 `{"$from": {"job": "…", "field": "result/camera"}}`; what it took from all earlier ones of a kind as `{"$each": …}`.
 """
 

@@ -9,9 +9,9 @@ from typing import Any, get_args
 from pydantic import BaseModel
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
+from service.computations import job_kinds
 from service.core.gates.measure_names import REGISTRATION_MEASURE_NAMES, measure_name
 from service.core.protocol.models import Protocol, Step
-from service.jobs import job_kinds
 from service.steps import step_kinds
 from service.steps.context import StepKind
 from service.steps.measures import Measure, RegistrationMeasures

@@ -13,9 +13,9 @@ from sqlalchemy import Connection, text
 from service.audit.background import IncrementalResults, PartialResult
 from service.audit.record.rows import EventRow, head, plain, read_rows
 from service.audit.record.search import ArtefactRow, artefacts_of_events, one_artefact
+from service.computations import job_kinds
 from service.core.jobs import Each, Reference, references_in
 from service.core.records.events import FilesKept, JobEnqueued
-from service.jobs import job_kinds
 from service.store.events import parse_canonical
 from service.store.store import Store
 

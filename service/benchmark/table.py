@@ -20,8 +20,8 @@ from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.heat_map import HeatScale, Panel, heat_bar, heat_row
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
+from service.core.text.words import SIMULATED
 from service.dataset.formats.meshes import png
-from service.dataset.records import SIMULATED
 
 _NONE = "–"
 

@@ -12,6 +12,7 @@ import typer
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, RunOption, console, print_json, reporting_errors
 from service.cli.options import OperatorOption, PasswordOption, acting_person, typed_password
+from service.computations import term
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, OperatorAction
@@ -19,7 +20,6 @@ from service.core.run.actions import VERBS, capture_refusal, record_to_sign, ref
 from service.core.run.fold import fold
 from service.core.run.state import RunState, connected_arms, lost_arms
 from service.core.text.words import reason_of
-from service.jobs import term
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts, who_pauses
 from service.people.sessions import People

@@ -34,6 +34,10 @@ from service.cli.intrinsics import (
     intrinsics_command,
     searched,
 )
+from service.computations.calibrate.records import BoardSeen, HandEye
+from service.computations.conversion import hand_eye_record, seen_board
+from service.computations.kind import JobRecord
+from service.computations.records import Matrix, matrix
 from service.compute.arm_kinematics import active_tool, matching_arm, solve_joints
 from service.compute.board.board import Board
 from service.compute.board.next_poses import SuggestedPose, draw_board_plan, suggest_board_poses
@@ -61,10 +65,6 @@ from service.core.geometry import Array, Transform
 from service.core.text.files import file_text, parse_json
 from service.core.text.words import counted
 from service.core.units import LengthUnit, mm
-from service.jobs.calibration_records import BoardSeen, HandEye
-from service.jobs.kind import JobRecord
-from service.jobs.records import Matrix, matrix
-from service.worker.records import hand_eye_record, seen_board
 
 _BESIDE = {"T_flange_camera": "T_base_camera", "T_base_board": "T_flange_board"}
 

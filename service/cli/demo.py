@@ -37,6 +37,7 @@ from service.cli.common import (
     shipped_protocols,
 )
 from service.cli.run import drive, end_with_children, sigterm_like_ctrl_c
+from service.computations.evaluate import Row
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, inverse
@@ -45,7 +46,6 @@ from service.core.units import mm
 from service.dataset.export_folder import check_folder
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary, summarise
-from service.jobs.evaluate import Row
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

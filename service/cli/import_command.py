@@ -36,6 +36,7 @@ from service.cli.options import (
     described,
 )
 from service.cli.run import WorkerOption, drive
+from service.computations.evaluate import Row
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
@@ -44,7 +45,6 @@ from service.core.units import megabytes
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import summarise
 from service.import_folder import CtReading, find_places, import_rig, list_import
-from service.jobs.evaluate import Row
 from service.rig import Rig
 from service.run_record import recorded_root
 from service.run_start import start_run

@@ -23,6 +23,8 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
+from service.computations.calibrate.records import Intrinsics
+from service.computations.conversion import intrinsics_record
 from service.compute.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
 from service.compute.board.search import UsableViews, find_boards, probe_board, usable_views
 from service.compute.images.photographs import image_folder, image_size
@@ -42,8 +44,6 @@ from service.compute.intrinsics.uncertainty import (
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.text.words import counted
 from service.core.units import metres, mm
-from service.jobs.calibration_records import Intrinsics
-from service.worker.records import intrinsics_record
 
 _SQUARE_MM = (0.5, 1000.0)  # plausible squares; anything else is probably in another unit
 

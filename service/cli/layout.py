@@ -12,6 +12,7 @@ from rich.table import Table
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
 from service.cli.spheres import spheres_of
+from service.computations.conversion import judged_layout
 from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
 from service.compute.layout.moves import Move, suggest_moves
@@ -22,7 +23,6 @@ from service.compute.poses.camera_files import read_camera_json, read_spheres_js
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import metres, mm
-from service.worker.records import judged_layout
 
 
 def layout_command(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
+from service.computations import term
 from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol, Step, irreversible_warning
@@ -25,7 +26,6 @@ from service.core.run.state import RunState
 from service.core.shown_text import shown
 from service.core.text.files import parse_json
 from service.core.text.words import reason_of
-from service.jobs import term
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for

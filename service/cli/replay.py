@@ -28,10 +28,10 @@ from service.cli.common import (
     write_whole,
 )
 from service.cli.terminal_output import styled
+from service.computations import term
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe
 from service.core.units import megabytes
-from service.jobs import term
 from service.worker.loop import HANDLERS
 
 _COULD_NOT = 2

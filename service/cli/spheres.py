@@ -24,6 +24,7 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
+from service.computations.conversion import measured_sphere
 from service.compute.surfaces.mesh_spheres import (
     MeasuredRadius,
     MeshSphere,
@@ -35,7 +36,6 @@ from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.words import counted
 from service.core.units import metres, mm
-from service.worker.records import measured_sphere
 
 _NAMED = 3  # most spheres listed in an error
 

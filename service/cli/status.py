@@ -18,6 +18,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.terminal_output import listed
+from service.computations import live_summary, live_view
 from service.core.gates.verdict import Standing, describe, standing
 from service.core.records.entered import about_rows
 from service.core.records.events import GateVerdict
@@ -25,7 +26,6 @@ from service.core.recovery import takes_words, ways_on
 from service.core.run.expected import tries_words
 from service.core.run.state import RunState, StepState, lost_arms
 from service.core.text.words import time_utc
-from service.jobs import live_summary, live_view
 from service.run_record import open_jobs, read_log, results_to_come
 from service.run_start import recorded_run
 from service.steps.coats import coats

@@ -27,10 +27,11 @@ K = TypeVar("K", bound=DeclaredKind)
 
 
 def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
-    """Return the kinds of this type by name: KIND or KINDS of each module below `package`, and those of entry points.
+    """Return the kinds of this type by name: KIND or KINDS of each module in `package`, and those of entry points.
 
     Args:
-        package: the name of a package, whose modules are searched at any depth, or of one module.
+        package: the name of a package, whose folders are searched, or its modules if it has no folders; or the name
+            of one module.
         group: the group of entry points, each of which names a kind.
         kind: the type of what is declared.
 
@@ -64,10 +65,13 @@ def _plug_ins(_path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
 
 
 def _modules(package: str) -> list[str]:
+    """Return the modules that declare kinds; a folder declares one in its `__init__.py`, and computes it beside."""
     path = getattr(importlib.import_module(package), "__path__", None)
     if path is None:
         return [package]
-    return [found.name for found in pkgutil.walk_packages(path, f"{package}.") if not found.ispkg]
+    inside = list(pkgutil.iter_modules(path, f"{package}."))
+    folders = [found.name for found in inside if found.ispkg]
+    return folders or [found.name for found in inside]
 
 
 class KindsOnDemand(Mapping[str, K]):

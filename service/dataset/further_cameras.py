@@ -8,6 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from service.computations.further_camera import Answer
+from service.computations.records import Matrix
 from service.core.clocks import ClockOffset, clock_offset
 from service.core.geometry import Transform
 from service.core.protocol.models import Protocol
@@ -16,8 +18,6 @@ from service.core.records.events import ArtefactRef, FurtherExposure, RecordedVi
 from service.core.run.state import RunState
 from service.core.units import mm, mrad
 from service.dataset.registrations import further_cameras
-from service.jobs.further_camera import Answer
-from service.jobs.records import Matrix
 
 
 @dataclass(frozen=True, slots=True)

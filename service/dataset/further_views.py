@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from service.computations.further_camera import Answer
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
 from service.compute.registration.pose_errors import product_jacobians
@@ -19,7 +20,6 @@ from service.core.units import mm, mrad
 from service.dataset.further_cameras import pose_sigmas
 from service.dataset.registrations import further_cameras
 from service.dataset.summary import RunSummary
-from service.jobs.further_camera import Answer
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from service.computations.register import ARM
 from service.compute.pixels.masks import Cylinder, WorldSphere, posts_below
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, apply, inverse
 from service.dataset.records import Mesh, PosedView
 from service.dataset.summary import RunSummary
-from service.jobs.register import ARM
 from service.rig import RigSection, parse_recorded_rig
 
 _CANDIDATES = 300  # faces whose normals are tried as the board's

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.computations.records import SpheresFound
 from service.compute.ground_truth.chamfer import ChamferSettings, chamfer, sample
 from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.fuse import Source
@@ -31,7 +32,6 @@ from service.dataset.records import DataSet, Mesh
 from service.dataset.registrations import last_result
 from service.dataset.scene_view import MeshColours, Scene, SceneMesh, SceneSphere, decimated, scene_json
 from service.dataset.summary import MESH, RecordedFusion, RunSummary
-from service.jobs.records import SpheresFound
 
 PICTURE = "fusion_picture"  # kind of its artefact
 _HIGH = 99.0  # percentile of the sigmas at the end of the colours

@@ -12,12 +12,13 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
+from service.computations.evaluate import ErrorBudget, Row
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement, Party, doi_address, licence_address, party
-from service.jobs.evaluate import ErrorBudget, Row
+from service.core.text.words import SIMULATED
 
 NOT_STATED = "not stated"
 
@@ -160,9 +161,6 @@ def _party(text: str, otherwise: Literal["Person", "Organization", ""] = "") -> 
         return party(text, otherwise=otherwise)
     except DataError:
         return Party(text, otherwise or "Person")
-
-
-SIMULATED = "SIMULATED: made by a simulated rig, not by a camera in front of a specimen"
 
 
 @dataclass(frozen=True, slots=True)

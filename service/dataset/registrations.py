@@ -8,21 +8,21 @@ with the smallest predicted error is shown (`best_registration`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
 from pydantic import ValidationError
 
+from service.computations import evaluate, further_camera, register, structure_from_motion
+from service.computations.evaluate import ErrorBudget, Row, best_row
+from service.computations.kind import JobRecord
+from service.computations.register import Registration, Registrations
 from service.core.errors import IntegrityError
 from service.core.gates.release import late_words
 from service.core.protocol.models import Protocol
 from service.core.protocol.step_params import Gives
 from service.core.run.state import JobState, RunState, lane_of
-from service.jobs import evaluate, further_camera, register, structure_from_motion
-from service.jobs.evaluate import ErrorBudget, Row
-from service.jobs.kind import JobRecord
-from service.jobs.register import Registration, Registrations
 
 _R = TypeVar("_R", bound=JobRecord)
 
@@ -154,11 +154,6 @@ def best_registration(protocol: Protocol, state: RunState) -> str | None:
     return min(full, key=lambda name: _predicted_m2(found[name]), default=None)
 
 
-def best_row(rows: Sequence[Row]) -> Row:
-    """Return the row of an evaluation's table with the smallest error on control spheres; of equal ones the first."""
-    return min(rows, key=_error_mm)
-
-
 def better_later(protocol: Protocol, state: RunState) -> Row | None:
     """Return the table's best row if it arrived after the evaluation and is better than the run's own; else None."""
     own = own_registration(protocol, state)
@@ -172,10 +167,6 @@ def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
     """Return the rows of the table that the evaluation step made: those that were judged and signed."""
     result = last_result(protocol, state, "accuracy", evaluate.Answer)
     return [] if result is None else list(result.table)
-
-
-def _error_mm(row: Row) -> float:
-    return row.mean_radial_error_mm
 
 
 def _predicted_m2(record: Registration) -> float:

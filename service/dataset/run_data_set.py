@@ -13,6 +13,8 @@ import numpy as np
 
 from drivers.meshes.companions import companion_names
 from drivers.meshes.foreign_text import alike
+from service.computations.records import SpheresFound
+from service.computations.register import Registration
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import WorldSphere, hull_mask
 from service.compute.pixels.render import RayMesh
@@ -30,8 +32,6 @@ from service.dataset.records import DataSet, Mesh, PosedView, ScanFile
 from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary, control_centres, control_scan, registered_scan
 from service.dataset.view_covariances import view_covariances
-from service.jobs.records import SpheresFound
-from service.jobs.register import Registration
 
 _POINTS = 2000  # of the mesh, by which the sparse views are chosen
 

@@ -12,6 +12,10 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
+from service.computations import fuse
+from service.computations.evaluate import ErrorBudget, Row
+from service.computations.records import Point, SpheresFound
+from service.computations.register import Registration
 from service.compute.ground_truth.surface import read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply
@@ -28,10 +32,6 @@ from service.dataset.registrations import (
     registrations,
     result_of_step,
 )
-from service.jobs import fuse
-from service.jobs.evaluate import ErrorBudget, Row
-from service.jobs.records import Point, SpheresFound
-from service.jobs.register import Registration
 from service.store.store import Store
 
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import ValidationError
 
+from service.computations import hybrid, register
+from service.computations.register import Registration
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, skew
 from service.core.jobs import jobs_of
 from service.core.run.state import JobState
 from service.core.units import mm, mrad
 from service.dataset.summary import RunSummary
-from service.jobs import hybrid, register
-from service.jobs.register import Registration
 
 
 def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:

@@ -14,8 +14,8 @@ from drivers.errors import DeviceTimeoutError
 from drivers.interfaces import CtSource, DeviceReport, ScannedMesh
 from drivers.meshes.foreign_text import name_of
 from drivers.meshes.polygons import in_doubt
+from service.computations.records import JudgedLayout
 from service.core.records.events import ArtefactRef, FilesKept, Uncertainty
-from service.jobs.records import JudgedLayout
 from service.steps.context import StepContext
 from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact

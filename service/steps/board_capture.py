@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from service.computations.records import Camera
 from service.compute.board.board import Board
 from service.compute.board.design import CalibrationTargets, ChosenViews, PlanPrediction
 from service.compute.board.knowledge import BoardKnowledge, refined_knowledge
@@ -17,7 +18,6 @@ from service.core.gates.verdict import describe, evaluate_gates
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import GateVerdict
 from service.core.text.words import counted
-from service.jobs.records import Camera
 from service.steps.board_looks import BoardLooks, SearchedBoardImage
 from service.steps.board_plan import (
     START,

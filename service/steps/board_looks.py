@@ -7,11 +7,11 @@ from typing import TypedDict
 
 import numpy as np
 
+from service.computations import board_view
+from service.computations.records import ImageFile, image_of
 from service.compute.board.board import Board, BoardView
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import JobState
-from service.jobs import board_view
-from service.jobs.records import ImageFile, image_of
 from service.steps.context import JobRequest, StepContext
 from service.steps.retakes import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 

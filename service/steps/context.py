@@ -19,6 +19,7 @@ from drivers.interfaces import (
     Scanner,
     Transform,
 )
+from service.computations.kind import JobKind, JobRecord
 from service.core.errors import OrthocaptureError
 from service.core.jobs import Each, Reference
 from service.core.protocol.models import Protocol as LabProtocol
@@ -29,7 +30,6 @@ from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record
 from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import WAITED, JobState
-from service.jobs.kind import JobKind, JobRecord
 from service.rig import CollisionSection, FurtherCameraSection, LensSection, ObstacleSection, OpticsSection
 from service.steps.measures import MeasureRecord
 from service.store.records import NewArtefact

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from service.computations import detect_spheres, evaluate, features, hybrid, match, register, structure_from_motion
+from service.computations.kind import JobRecord, read_part
+from service.computations.records import Camera, ImageFile
 from service.core.jobs import Jobs, Reference, job_key, jobs_of, newest_job
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import LATER, WAITED, RunState
-from service.jobs import detect_spheres, evaluate, features, hybrid, match, register, structure_from_motion
-from service.jobs.kind import JobRecord, read_part
-from service.jobs.records import Camera, ImageFile
 from service.steps.context import JobRequest
 from service.steps.front_end import early_matches
 from service.steps.registration_jobs import RegistrationJobs, Task, name_of, recorded_registration_jobs

@@ -12,6 +12,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from service.computations import calibrate, features, match
+from service.computations.features import FrontEndArguments, SfmEffort
+from service.computations.kind import read_part
+from service.computations.records import Camera, ImageFile
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
@@ -19,10 +23,6 @@ from service.core.jobs import Jobs, job_key
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import EARLY, JobState, RunState
-from service.jobs import calibrate, features, match
-from service.jobs.features import FrontEndArguments, SfmEffort
-from service.jobs.kind import read_part
-from service.jobs.records import Camera, ImageFile
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import EarlierAnswer, earlier_answer
 from service.steps.registration_sources import WantedRegistrations

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 
+from service.computations import develop, further_camera
+from service.computations.records import ImageFile
 from service.compute.images.develop_parameters import PARAMETERS
 from service.core.jobs import Reference
 from service.core.records.events import FurtherExposure, ViewpointCaptured
 from service.core.run.state import JobState
-from service.jobs import develop, further_camera
-from service.jobs.records import ImageFile
 from service.steps.context import JobRequest, JobResult, StepContext
 from service.steps.inputs import raw_of
 from service.steps.registration_sources import most_preferred

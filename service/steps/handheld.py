@@ -9,6 +9,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from service.computations import calibrate, coverage_points, hand_board, hand_view, layout
+from service.computations.records import Limits, Point, image_of
 from service.core.errors import ConfigurationError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
@@ -16,8 +18,6 @@ from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, 
 from service.core.records.events import Record, ViewHeld
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
-from service.jobs import calibrate, coverage_points, hand_board, hand_view, layout
-from service.jobs.records import Limits, Point, image_of
 from service.steps.context import JobRequest, StepContext, StepOutcome
 from service.steps.exposure import wanted_settings
 from service.steps.inputs import artefact_of, earlier_answer, held_views, intrinsics_covariance_of

@@ -8,14 +8,9 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from service.core.errors import ConfigurationError, IntegrityError
-from service.core.jobs import Each, Reference, answered_by
-from service.core.records.events import ArtefactRef, RecordedView, ViewHeld, ViewpointCaptured
-from service.core.run.state import JobState
-from service.core.text.words import counted
-from service.jobs import calibrate, hand_board, hand_view
-from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import (
+from service.computations import calibrate, hand_board, hand_view
+from service.computations.kind import JobKind, JobRecord
+from service.computations.records import (
     ArmCorrection,
     FurtherArm,
     Matrix,
@@ -24,6 +19,11 @@ from service.jobs.records import (
     PosedPhotograph,
     image_of,
 )
+from service.core.errors import ConfigurationError, IntegrityError
+from service.core.jobs import Each, Reference, answered_by
+from service.core.records.events import ArtefactRef, RecordedView, ViewHeld, ViewpointCaptured
+from service.core.run.state import JobState
+from service.core.text.words import counted
 from service.steps.context import StepContext
 
 R = TypeVar("R", bound=JobRecord)
@@ -205,7 +205,7 @@ class CameraMounting:
 
 
 def mounting_of(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> CameraMounting:
-    """Return what turns robot poses into camera poses (service/worker/inputs.py), with the references to it.
+    """Return what turns robot poses into camera poses (service/computations/inputs.py), with the references to it.
 
     A correction belongs to one arm: it is given with the stations at which that arm stood.
 

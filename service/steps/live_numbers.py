@@ -9,6 +9,18 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from service.computations import calibrate, coverage_points, further_view, live_summary, live_view, locate_spheres
+from service.computations.records import (
+    Camera,
+    Hash,
+    ImageFile,
+    Limits,
+    Matrix,
+    Mounting,
+    Point,
+    PosedPhotograph,
+    image_of,
+)
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import limits as gate_text
@@ -18,8 +30,6 @@ from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, 
 from service.core.records.events import FurtherExposure, Record, RecordedView, ViewpointCaptured
 from service.core.run.state import LIVE, JobState
 from service.core.units import metres, rad_of_mrad
-from service.jobs import calibrate, coverage_points, further_view, live_summary, live_view, locate_spheres
-from service.jobs.records import Camera, Hash, ImageFile, Limits, Matrix, Mounting, Point, PosedPhotograph, image_of
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, earlier_answer, mounting_of, with_robot_pose
 from service.steps.notes import SPOILT, SUGGESTION, suggested_views

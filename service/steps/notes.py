@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.computations.live_summary import Suggestion
+from service.computations.records import Matrix
 from service.core.run.state import StepState
 from service.core.text.words import counted
-from service.jobs.live_summary import Suggestion
-from service.jobs.records import Matrix
 
 BOARD_POSES, SUGGESTION = "board_poses", "suggested_viewpoints"
 SPOILT = "spoilt images"  # images that a retry of the step repeats

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from service.computations import detect_spheres, job_kinds
+from service.computations.features import ImagesToMatch
+from service.computations.kind import JobRecord, read_part
+from service.computations.match import PairsToMatch
+from service.computations.records import ImageFile, ImagesCamera, PosedPhotograph
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.jobs import Reference, arguments_name, jobs_of, newest_job, resolve
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import LATER, REDUCED, WAITED, JobState, RunState
-from service.jobs import detect_spheres, job_kinds
-from service.jobs.features import ImagesToMatch
-from service.jobs.kind import JobRecord, read_part
-from service.jobs.match import PairsToMatch
-from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
 from service.steps.context import JobRequest
 from service.steps.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
 from service.steps.registration_sources import PLANNED, QUICK, WantedRegistrations, decisive, posed

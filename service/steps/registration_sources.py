@@ -7,10 +7,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from service.computations.features import SfmEffort
+from service.computations.records import PosedPhotograph
+from service.computations.register import ARM
 from service.core.protocol.models import Protocol, Step
-from service.jobs.features import SfmEffort
-from service.jobs.records import PosedPhotograph
-from service.jobs.register import ARM
 
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
 # hand-eye calibration estimated them, and each pose's error as the spheres show it. "spheres" locates each image of a

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from service.computations.records import image_of
 from service.core.errors import ImagesSpoiltError
 from service.core.gates.verdict import describe, evaluate_gates
 from service.core.records.events import RecordedView
 from service.core.run.state import JobState
-from service.jobs.records import image_of
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING, SPOILT, images_to_repeat
 

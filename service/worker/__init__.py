@@ -1,1 +1,1 @@
-"""The registration worker: claims jobs, computes, appends results. A job, or jobs that share much, have a file."""
+"""The worker: claims jobs, has them computed side by side in its processes, and records what they give."""

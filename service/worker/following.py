@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial, reduce
 from typing import Any
 
+from service.computations.job import JobAnswer
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.gates.release import late_s
 from service.core.jobs import jobs_of, references_in, resolve
@@ -17,7 +18,6 @@ from service.steps.due_jobs import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
-from service.worker.job import JobAnswer
 
 _log = logging.getLogger(__name__)
 

@@ -15,16 +15,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from service.computations import job_kinds, term
+from service.computations.job import Handler, JobAnswer, JobContext, handler_of
+from service.computations.kind import Demand
+from service.computations.memory_grants import MemoryGrants
 from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.run.state import Lane
-from service.jobs import job_kinds, term
-from service.jobs.kind import Demand
-from service.jobs.memory_grants import MemoryGrants
 from service.logs.file_log import at
 from service.store.records import Job, LeaseLostError
 from service.store.store import Store
-from service.worker.job import Handler, JobAnswer, JobContext, handler_of
 
 if TYPE_CHECKING:
     from service.worker.following import FollowedRuns

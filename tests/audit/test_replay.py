@@ -17,13 +17,13 @@ from service.audit.record.run import read_run
 from service.audit.replay.differences import compare_data, compare_files
 from service.audit.replay.replay import ReplayReport, replay
 from service.cli.main import app
+from service.computations import job_kinds
+from service.computations.job import Handler, JobAnswer, RecordedContext
+from service.computations.records import SpheresFound
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.jobs import Reference, jobs_of, references_in, resolve
 from service.core.records.events import ArtefactRef
-from service.jobs import job_kinds
-from service.jobs.records import SpheresFound
 from service.worker import loop
-from service.worker.job import Handler, JobAnswer, RecordedContext
 from tests.support.runs.recorded_run import record_run
 
 _locate_spheres = loop.HANDLERS["locate_spheres"]

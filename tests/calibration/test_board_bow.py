@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from service.computations.calibrate.records import BoardSeen
+from service.computations.conversion import intrinsics_record, seen_board
 from service.compute.board.board import Board, BoardView
 from service.compute.camera_model import CameraModel
 from service.compute.intrinsics import adjustment
@@ -21,8 +23,6 @@ from service.compute.intrinsics.uncertainty import (
     projection_uncertainty,
 )
 from service.core.geometry import Array, apply, inverse, look_at, transform
-from service.jobs.calibration_records import BoardSeen
-from service.worker.records import intrinsics_record, seen_board
 
 BOARD = Board(10, 14, 0.025)
 SMALL = Board(9, 6, 0.02)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.computations import calibrate
+from service.computations.job import JobAnswer, JobContext, RecordedContext
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply
-from service.jobs import calibrate
 from service.store.store import Store
-from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 from tests.support.boards.board_sessions import BOARD, CAMERA, T_FLANGE_CAMERA, noisy_session
 

@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 from bench.calibration.arm_errors import one as hand_eye_of
 from bench.calibration.arm_errors import seen_from_nominal_flange
 from service.cli.calibrate import calibrate_app
+from service.computations import records
+from service.computations.conversion import arm_correction_record, corrected_mounting, hand_eye_record
 from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm_kinematics import (
     chain,
@@ -34,8 +36,6 @@ from service.compute.poses.robot_files import read_joints_csv
 from service.core.arms.model import ArmModel, arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
-from service.jobs import records
-from service.worker.records import arm_correction_record, corrected_mounting, hand_eye_record
 from simulators.scene.arm import ARM_ERRORS, ArmErrorKind, ArmErrors, perturbed_forward
 from simulators.scene.factory_calibrations import CALIBRATIONS, draw_departures
 from simulators.scene.world import Scene

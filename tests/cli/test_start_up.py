@@ -16,9 +16,9 @@ import pytest
 import typer
 
 from service.cli.main import app
+from service.computations import job_kinds
 from service.core.loading import end_loading, loading
 from service.core.protocol.models import load_protocol
-from service.jobs import job_kinds
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models, step_kinds
@@ -111,7 +111,9 @@ def test_drivers_processes_and_simulators_start_without_what_they_may_not_need(p
     assert not (NUMERICS - needs | OF_THE_WEB | {"sqlalchemy", "typer", "yaml"}) & set(modules)
 
 
-@pytest.mark.parametrize(("package", "kinds"), [("service.jobs", job_kinds), ("service.steps.kinds", step_kinds)])
+@pytest.mark.parametrize(
+    ("package", "kinds"), [("service.computations", job_kinds), ("service.steps.kinds", step_kinds)]
+)
 def test_a_kind_is_alone_in_the_module_of_its_name(package: str, kinds: Callable[[], Mapping[str, Any]]) -> None:
     path = importlib.import_module(package).__path__
     places = [found.name for found in pkgutil.walk_packages(path, f"{package}.")]
@@ -123,11 +125,11 @@ def test_a_kind_is_alone_in_the_module_of_its_name(package: str, kinds: Callable
 
 def test_a_kind_is_found_without_the_others() -> None:
     modules = said_by(
-        "import json, sys; from service.jobs import job_kinds; assert job_kinds()['match'].name == 'match'; "
+        "import json, sys; from service.computations import job_kinds; assert job_kinds()['match'].name == 'match'; "
         "assert job_kinds().get('match') is job_kinds()['match']; print(json.dumps(sorted(sys.modules)))"
     )
-    assert "service.jobs.match" in modules
-    assert "service.jobs.fuse" not in modules
+    assert "service.computations.match" in modules
+    assert "service.computations.fuse" not in modules
 
 
 def test_the_collector_rests_only_while_modules_are_loaded() -> None:

@@ -23,11 +23,11 @@ from service.cli.demo import free_address
 from service.cli.main import app
 from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
+from service.computations import term
 from service.compute.matching.methods.method import matchers
 from service.core.protocol.models import irreversible_warning, load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.exporter import exporters
-from service.jobs import term
 from service.steps import params_models
 from service.steps.live_numbers import seen_words
 from tests.support.processes.forked import Forked

@@ -19,10 +19,10 @@ EDGES = {
     "service/core/jobs.py": "hashes recorded arguments of any kind of job; references as they stand in them",
     "service/core/records/base.py": "writes a record into an event",
     "service/import_folder.py": "the camera of an event, as a photograph states it",
-    "service/jobs/kind.py": "reads and writes the arguments and answers of jobs",
+    "service/computations/kind.py": "reads and writes the arguments and answers of jobs",
     "service/steps/exposure.py": "the camera of an event, as a photograph states it",
     "service/worker/following.py": "arguments of a job with references resolved, before its kind reads them",
-    "service/worker/job.py": "writes an answer into an event",
+    "service/computations/job.py": "writes an answer into an event",
     # rows of SQL, and their hashes
     "service/people/rows.py": "the row of a session, which is hashed",
     "service/store/events.py": "hashes and writes the rows of events",
@@ -47,8 +47,8 @@ EDGES = {
     "service/dataset/croissant.py": "writes croissant.json",
     "service/dataset/about_run.py": "writes dataset.json",
     "service/dataset/formats/radiance.py": "writes unit_box.json",
-    "service/worker/hand_answer.py": "writes and reads the file of a hand-held image",
-    "service/worker/live_station.py": "writes and reads the file of an image of the robot",
+    "service/computations/hand_view/answer.py": "writes and reads the file of a hand-held image",
+    "service/computations/live_view/station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/sfm/colmap_process.py": "messages of a child process",
     "service/compute/sfm/child.py": "messages of a child process",

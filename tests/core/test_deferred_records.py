@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from service.computations import job_kinds
 from service.core.records.base import Record
-from service.jobs import job_kinds
 from service.steps import step_kinds
 
 THREADS = 8

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.computations.job import JobContext, RecordedContext
 from service.core.errors import ComputeError
 from service.store.store import Store
-from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 
 Volume = np.ndarray[tuple[int, ...], np.dtype[np.int16]]

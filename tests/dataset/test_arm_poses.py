@@ -10,13 +10,13 @@ import pytest
 
 from service.audit.record.run import RecordedRun, read_run
 from service.audit.replay.recomputed import ScratchStore
+from service.computations import register
+from service.computations.job import JobAnswer
 from service.compute.matching.pairs import relative_covariance
 from service.core.run.state import JobState
 from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import RunSummary
 from service.dataset.view_covariances import pose_covariance
-from service.jobs import register
-from service.worker.job import JobAnswer
 from tests.support.recorded.recomputed import ARM, arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 

@@ -15,11 +15,11 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from service.computations.evaluate import Contribution, ErrorBudget, Row
 from service.core.records.data_set import DataSetStatement
 from service.dataset.exporter import exporter, exporters, write_data_set
 from service.dataset.pixels import undistorted_data_set
 from service.dataset.records import About, DataSet, UsedDevice
-from service.jobs.evaluate import Contribution, ErrorBudget, Row
 from tests.support.scenes.croissant import read_croissant
 from tests.support.scenes.posed import posed_data_set
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from service.computations.evaluate.compute import budget_record
 from service.compute.evaluation.error_budget import (
     Alignment,
     ErrorBudget,
@@ -27,7 +28,6 @@ from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform
-from service.worker.evaluate import budget_record
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
 from tests.support.stated_errors import sigma_components_m
 

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from service.computations.job import JobContext, RecordedContext
 from service.compute.markers.records import outline_record
 from service.core.errors import ComputeError
 from service.store.store import Store
-from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
 

@@ -14,18 +14,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import CtSource, DeviceIdentity, DeviceReport, Mesh, ScanExport, ScannedMesh, Scanner
+from service.computations.job import JobContext
 from service.compute.ground_truth.surface import Surface, read_ply
 from service.core.errors import ProtocolError
 from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
+from service.core.text.words import SIMULATED
 from service.dataset.about_run import about_run
 from service.dataset.preview_surfaces import SimplifiedMesh, fused_mesh, shown_distances
-from service.dataset.records import SIMULATED
 from service.dataset.summary import recorded_fusion, summarise
 from service.steps import params_models
-from service.worker.job import JobContext
 from service.worker.loop import HANDLERS
 from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT, ct_mesh, height, scan_mesh, with_spheres
 from tests.support.recorded.registration_record import registration_record

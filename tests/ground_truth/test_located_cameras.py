@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial import KDTree
 
 from service.audit.record.run import read_run
+from service.computations import locate_spheres, register
 from service.core.geometry import apply, inverse
 from service.core.jobs import Reference, jobs_of, references_in, resolve
-from service.jobs import locate_spheres, register
 from service.steps.kinds.ground_truth import with_located_images
 from tests.support.recorded.recomputed import arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run

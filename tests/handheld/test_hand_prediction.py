@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from service.computations import hand_view as job
+from service.computations.hand_view.answer import HandGuide, HandheldImage
+from service.computations.records import Camera, Limits
+from service.computations.scene import CaptureScene
 from service.compute.planning.coverage import CoverageLimits
 from service.compute.planning.next_views import predicted_information
 from service.core.geometry import apply, inverse
-from service.jobs import hand_view as job
-from service.jobs.records import Camera, Limits
-from service.worker.hand_answer import HandGuide, HandheldImage
-from service.worker.scene import CaptureScene
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, scene
 
 MADE = scene(6, width=1920, seed=2)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from service.computations.job import JobAnswer, RecordedContext
+from service.computations.layout import Answer, LayoutDetails
 from service.core.records.events import JobFinished, OperatorAction, StepMeasured, StepNote, StepPassed
 from service.core.records.events import Uncertainty as Bounds
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.jobs.layout import Answer, LayoutDetails
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.worker import loop
-from service.worker.job import JobAnswer, RecordedContext
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.rig.bench_rig import answer

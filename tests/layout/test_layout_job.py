@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from service.computations.job import JobContext
 from service.store.store import Store
-from service.worker.job import JobContext
 from service.worker.loop import HANDLERS
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, camera, render
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.computations import job_kinds
+from service.computations.job import JobContext, RecordedContext, handler_of
 from service.compute.camera_model import CameraModel
 from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.markers.cones import cone_of_sphere
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse
-from service.jobs import job_kinds
 from service.store.store import Store
-from service.worker.job import JobContext, RecordedContext, handler_of
 from simulators.rendering.render import REFERENCE, Renderer
 from simulators.rendering.sensor import camera_picture, read_out
 from simulators.scene.world import NOMINAL_LUX, Scene

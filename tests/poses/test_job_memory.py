@@ -10,18 +10,18 @@ from pathlib import Path
 import psutil
 import pytest
 
+from service.computations import job_kinds
+from service.computations.job import JobAnswer, RecordedContext
+from service.computations.kind import Demand
+from service.computations.memory_grants import Grant, MemoryGrants, waiting_for_memory
 from service.compute.resources import MachineMemory, machine_memory, processes_for
 from service.core.errors import ComputeError, IllegalTransitionError
 from service.core.records.events import JobFailed
-from service.jobs import job_kinds
-from service.jobs.kind import Demand
-from service.jobs.memory_grants import Grant, MemoryGrants, waiting_for_memory
 from service.store.records import LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker import loop
-from service.worker.job import JobAnswer, RecordedContext
 from service.worker.loop import work
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, enqueue, start_run
@@ -235,7 +235,7 @@ def test_a_full_disk_keeps_no_job_from_being_computed(tmp_path: Path, clock: Ste
 
 
 def test_every_kind_states_what_it_demands() -> None:
-    from service.jobs.kind import usual_demand  # noqa: PLC0415 - only here
+    from service.computations.kind import usual_demand  # noqa: PLC0415 - only here
 
     assert [name for name, kind in job_kinds().items() if kind.demand is usual_demand] == []
 

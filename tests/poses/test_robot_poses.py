@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from service.computations import detect_spheres
+from service.computations.inputs import robot_camera_poses
+from service.computations.records import FurtherArm, Mounting, PosedPhotograph, matrix
 from service.core.geometry import Array
 from service.core.jobs import Reference
-from service.jobs import detect_spheres
-from service.jobs.records import FurtherArm, Mounting, PosedPhotograph, matrix
 from service.steps.context import JobRequest
-from service.worker.inputs import robot_camera_poses
 
 
 def shifted(x_m: float) -> Array:

@@ -12,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from service.computations.job import JobAnswer, RecordedContext
 from service.core.errors import ComputeError, StoreError
 from service.core.records.events import JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, LATER, LIVE, WAITED
@@ -19,7 +20,6 @@ from service.store.records import Job, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker import loop
-from service.worker.job import JobAnswer, RecordedContext
 from service.worker.loop import work
 from service.worker.pool import Pool, work_side_by_side
 from tests.support.processes import waiting

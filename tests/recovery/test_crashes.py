@@ -7,6 +7,8 @@ from itertools import pairwise
 
 import pytest
 
+from service.computations import board_view, calibrate
+from service.computations.records import Camera
 from service.core.errors import ComputeError
 from service.core.records.events import (
     JobEnqueued,
@@ -18,8 +20,6 @@ from service.core.records.events import (
 )
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.jobs import board_view, calibrate
-from service.jobs.records import Camera
 from service.monitor.snapshot import SignOfLife
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, KilledError

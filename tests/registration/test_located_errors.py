@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from service.computations import register
+from service.computations.job import JobContext, RecordedContext
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_record
 from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
 from service.core.geometry import Array, Transform, inverse
-from service.jobs import register
 from service.store.store import Store
-from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, Scene, exact_outlines, scene
 

@@ -24,11 +24,11 @@ from drivers.errors import DeviceError, DriverMissingError, IncompleteExportErro
 from drivers.interfaces import ScannedMesh
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from drivers.scan_profiles import profile_named, profile_names
+from service.computations.job import JobContext, RecordedContext
 from service.compute.surfaces.mesh_spheres import locate_spheres, wrong_unit
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.store.store import Store
-from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 from simulators.scan_station.formats import encode
 

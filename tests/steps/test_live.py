@@ -15,6 +15,10 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import CameraSettings
+from service.computations import live_view
+from service.computations.conversion import arm_correction_record
+from service.computations.inputs import robot_camera_poses
+from service.computations.job import JobAnswer, JobContext, RecordedContext
 from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm_kinematics import postures
 from service.compute.live import LiveView, clipped_fraction, register_station, sharpness
@@ -26,12 +30,8 @@ from service.compute.registration.hypotheses import paired
 from service.core.arms.model import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
-from service.jobs import live_view
 from service.store.store import Store
-from service.worker.inputs import robot_camera_poses
-from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS, work
-from service.worker.records import arm_correction_record
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 from tests.support.runs.computing_run import compute_jobs
@@ -289,7 +289,7 @@ def measured_run(
         compute_jobs(bench.store)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
-    monkeypatch.setattr("service.worker.live_view.find_outlines", exactly)
+    monkeypatch.setattr("service.computations.live_view.compute.find_outlines", exactly)
     bench.operator.on_show = serve
     return bench
 

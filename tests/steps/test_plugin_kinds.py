@@ -19,10 +19,10 @@ from typing import Annotated
 
 from service.core.protocol.step_params import StepParams
 from service.core.records.base import Record
-from service.jobs.kind import JobKind, JobRecord
+from service.computations.kind import JobKind, JobRecord
 from service.steps.context import Announcement, JobRequest, StepKind, StepOutcome
 from service.steps.measures import Measure, MeasureRecord
-from service.worker.job import JobAnswer
+from service.computations.job import JobAnswer
 
 
 class Arguments(JobRecord):

@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 
 from service.audit.bundle.export import export_bundle
 from service.cli.main import app
+from service.computations.job import JobAnswer, JobContext
 from service.core.records.events import JobFailed, StepNote
 from service.core.shown_text import storable, storable_data
 from service.store import events as event_module
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS, work
 from tests.support.hostile_places import STORED_AS, can_be_stored_as, refused_by_other_databases
 from tests.support.hostile_text import UNSTORABLE, obeyed

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.computations import fuse
 from service.core.geometry import apply
 from service.core.records.events import RegionDrawn
 from service.core.run.fold import fold
 from service.core.run.state import JobState
 from service.dataset.scene_view import scene_json, viewing_frame
-from service.jobs import fuse
 from service.run_record import RunRecord, read_log
 from service.run_start import recorded_run
 from service.web.scene.data import scene_of

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from service.computations.job import ArtefactStore, Handler, JobAnswer, RecordedContext
 from service.core.records.events import ArtefactRef
 from service.store.events import canonical
-from service.worker.job import ArtefactStore, Handler, JobAnswer, RecordedContext
 
 
 @dataclass

@@ -12,6 +12,7 @@ from sqlalchemy import Connection, text
 from service.audit.background import IncrementalResults, PartialResult
 from service.audit.record.rows import head, plain, root
 from service.audit.record.search import Facets
+from service.computations import evaluate
 from service.core.errors import IntegrityError, OrthocaptureError
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (
@@ -27,7 +28,6 @@ from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_
 from service.core.run.state import Deviation, RunState
 from service.core.text.words import counted
 from service.dataset.registrations import LateResult, late_results
-from service.jobs import evaluate
 from service.store.store import Store
 
 CHUNK = 300  # events in one step, after which waiting pages come first

@@ -13,6 +13,8 @@ from typing import Any, cast
 import numpy as np
 
 from service.audit.record.run import RecordedFiles
+from service.computations import register
+from service.computations.job import JobAnswer
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.jobs import Reference, computed_by, jobs_of, resolve
@@ -20,9 +22,7 @@ from service.core.records.events import ArtefactRef, JobFinished
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary
-from service.jobs import register
 from service.store.artefacts import hash_file
-from service.worker.job import JobAnswer
 
 _TELLING_DIGITS = 12  # a number with so many digits is recognised by its value, since nobody typed it
 _TELLING_BITS = (

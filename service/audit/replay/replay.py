@@ -14,16 +14,16 @@ import numpy as np
 from service.audit.record.run import RecordedFiles, RecordedRun
 from service.audit.replay.differences import Comparison, Difference, compare_data, compare_files
 from service.audit.replay.recomputed import Drift, RecomputedJobs, ScratchStore, drifts
+from service.computations import job_kinds
+from service.computations.job import JobAnswer, JobContext
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs import jobs_of, resolve
 from service.core.records.events import ArtefactRef, GateVerdict, JobEnqueued, JobFinished, SessionStarted
 from service.core.run.state import JobState
-from service.jobs import job_kinds
 from service.runner.software import software_versions
 from service.store.events import parse_canonical, payload_text
 from service.store.verification.verify import AuditReport, verify
-from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS
 
 Verdict = Literal["identical", "within_tolerance", "different", "not_replayed"]

@@ -20,12 +20,12 @@ from service.audit.report.blocks import (
     utc,
     words,
 )
+from service.computations.evaluate import ErrorBudget, Row
 from service.core.gates.acceptance import depends_on
 from service.core.text.words import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 from service.dataset.registrations import late_results, shared_adjustment_note
 from service.dataset.summary import RunSummary
-from service.jobs.evaluate import ErrorBudget, Row
 
 PAPER_LIMIT_MM = 0.35
 _LIMITED = "best_mean_radial_error_mm"

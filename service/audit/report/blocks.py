@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import ClassVar, Literal
 
+from service.computations import term
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing, figure, limits, standing
 from service.core.records.events import GateVerdict
-from service.jobs import term
 
 Tone = Literal["plain", "ok", "attention", "stop"]
 Style = Literal["text", "number", "code"]

@@ -28,13 +28,8 @@ from service.audit.report.blocks import (
     measured,
     utc,
 )
-from service.core.gates.acceptance import depends_on
-from service.core.geometry import Array
-from service.core.recorded_devices import RecordedOptics, recorded_optics
-from service.core.records.events import RecordedView
-from service.core.units import mm
-from service.jobs import calibrate
-from service.jobs.calibration_records import (
+from service.computations import calibrate
+from service.computations.calibrate.records import (
     Coverage,
     HandEye,
     Intrinsics,
@@ -42,7 +37,12 @@ from service.jobs.calibration_records import (
     ResidualField,
     Residuals,
 )
-from service.jobs.records import Camera
+from service.computations.records import Camera
+from service.core.gates.acceptance import depends_on
+from service.core.geometry import Array
+from service.core.recorded_devices import RecordedOptics, recorded_optics
+from service.core.records.events import RecordedView
+from service.core.units import mm
 
 _WIDTH = 480.0
 _LEGEND = 26.0

@@ -9,6 +9,9 @@ from datetime import datetime
 
 import numpy as np
 
+from service.computations import calibrate
+from service.computations.evaluate import Row
+from service.computations.records import Camera
 from service.core.errors import IntegrityError
 from service.core.gates.verdict import figure, limits, quantity, standing
 from service.core.geometry import Transform
@@ -18,9 +21,6 @@ from service.core.records.events import Event, GateVerdict, RunStarted
 from service.core.run.state import RunState, StepState
 from service.core.units import mm
 from service.dataset.registrations import evaluated
-from service.jobs import calibrate
-from service.jobs.evaluate import Row
-from service.jobs.records import Camera
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name

@@ -6,6 +6,8 @@ from datetime import datetime
 
 from service.core.errors import OrthocaptureError
 
+SIMULATED = "SIMULATED: made by a simulated rig, not by a camera in front of a specimen"  # in every file with room
+
 
 def counted(number: int, one: str, more: str = "") -> str:
     """Return a count as text: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""

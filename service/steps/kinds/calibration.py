@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
+from service.computations import calibrate
+from service.computations.calibrate.records import HandEye, KnownBoard
+from service.computations.records import Camera, Matrix, matrix
 from service.core.errors import ConfigurationError
 from service.core.protocol.step_params import (
     NAMES_CALIBRATION,
@@ -17,9 +20,6 @@ from service.core.protocol.step_params import (
 )
 from service.core.records.events import Record
 from service.core.units import metres
-from service.jobs import calibrate
-from service.jobs.calibration_records import HandEye, KnownBoard
-from service.jobs.records import Camera, Matrix, matrix
 from service.steps.board_poses import BoardPoses
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import EarlierAnswer, captured_images, earlier_answer

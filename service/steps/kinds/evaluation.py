@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+from service.computations import evaluate, locate_spheres, register
 from service.core.errors import ConfigurationError
 from service.core.jobs import Reference
 from service.core.protocol.step_params import (
@@ -21,7 +22,6 @@ from service.core.protocol.step_params import (
 )
 from service.core.records.events import Record
 from service.core.units import metres
-from service.jobs import evaluate, locate_spheres, register
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, earlier_answer, earlier_result
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures, Share

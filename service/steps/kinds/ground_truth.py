@@ -10,15 +10,15 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from service.computations import fuse, locate_spheres, register
+from service.computations.kind import read_part
+from service.computations.records import Mounting, Point, PosedPhotograph, has_poses
 from service.core.errors import ConfigurationError
 from service.core.jobs import Each, Jobs, Reference, jobs_of
 from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.run.state import JobState
 from service.core.units import metres
-from service.jobs import fuse, locate_spheres, register
-from service.jobs.kind import read_part
-from service.jobs.records import Mounting, Point, PosedPhotograph, has_poses
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import EarlierAnswer, artefact_of, earlier_answer
 from service.steps.measures import Count, Deg, ErrorMm, Measure, MeasureRecord, Share

@@ -10,12 +10,12 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from drivers.errors import ReleasedElsewhereError
+from service.computations import layout
+from service.computations.records import Point
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.step_params import NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, GateVerdict, Record
 from service.core.units import metres
-from service.jobs import layout
-from service.jobs.records import Point
 from service.steps.arrivals import keep, layout_uncertainties
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.exposure import wanted_settings

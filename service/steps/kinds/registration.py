@@ -13,14 +13,14 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from service.computations import calibrate, detect_spheres, further_camera, locate_spheres, register, term
+from service.computations.records import Mounting, PosedPhotograph
+from service.computations.register import Registration
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs import arguments_name
 from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
-from service.jobs import calibrate, detect_spheres, further_camera, locate_spheres, register, term
-from service.jobs.records import Mounting, PosedPhotograph
-from service.jobs.register import Registration
 from service.steps.context import JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.further_cameras import ExposureFiles, developed, locate_further_cameras
 from service.steps.inputs import (

@@ -10,14 +10,14 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from drivers.interfaces import ScanExport
+from service.computations import locate_spheres, merge_scans
+from service.computations.records import Point, SphereDetails
 from service.core.jobs import Reference
 from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
 from service.core.records.base import elapsed
 from service.core.records.events import ArtefactRef, Record
 from service.core.text.words import counted
 from service.core.units import metres
-from service.jobs import locate_spheres, merge_scans
-from service.jobs.records import Point, SphereDetails
 from service.steps.arrivals import keep_mesh, layout_uncertainties, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import earlier_answer, earlier_result

@@ -12,7 +12,7 @@ from service.audit.overview import findings
 from service.audit.overview.findings import correctable
 from service.audit.provenance import draw, origin
 from service.audit.record import rows, search
-from service.jobs import term
+from service.computations import term
 from service.store.records import SITE
 from service.web.audit.frame import ArtefactQuery, AuditState, CurrentAudit, EventQuery, audit_frame, link
 from service.web.page.rendering import render

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
+from service.computations.calibrate.records import ArmAnswer, HandEye
+from service.computations.conversion import corrected_mounting
+from service.computations.records import Camera
 from service.compute.arm_correction import corrected_T_base_flange
 from service.compute.arm_kinematics import nearest_posture
 from service.compute.board.board import Board
@@ -24,8 +27,6 @@ from service.core.protocol.models import CalibrationBoard as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.text.words import counted
 from service.core.units import deg, metres, mm
-from service.jobs.calibration_records import ArmAnswer, HandEye
-from service.jobs.records import Camera
 from service.rig import Rig
 from service.run_record import RunRecord
 from service.steps.board_plan import describe_prediction
@@ -36,7 +37,6 @@ from service.steps.plan_preview import preview_board_poses
 from service.web.record.images import recorded_rig_section
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import station_of
-from service.worker.records import corrected_mounting
 
 POSES = 6
 _USUAL_CORNER_PX = 0.1  # 1σ of a board corner, for records that do not state it

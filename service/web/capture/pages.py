@@ -12,8 +12,8 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
+from service.computations.live_summary import Suggestion
 from service.core.protocol.models import Step
-from service.jobs.live_summary import Suggestion
 from service.people.control import Control
 from service.people.person import Person
 from service.run_record import RunRecord

@@ -10,13 +10,13 @@ from typing import Literal
 
 import numpy as np
 
+from service.computations import further_view, live_summary, live_view
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
-from service.jobs import further_view, live_summary, live_view
 from service.run_record import RunRecord
 from service.steps.notes import suggested_views
 from service.web.record.images import (

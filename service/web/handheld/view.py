@@ -9,14 +9,14 @@ from typing import Literal
 
 import numpy as np
 
+from service.computations import coverage_points, hand_board, hand_view
+from service.computations.records import Matrix, image_of
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, Step
 from service.core.recorded_devices import recorded_report
 from service.core.records.events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
-from service.jobs import coverage_points, hand_board, hand_view
-from service.jobs.records import Matrix, image_of
 from service.run_record import RunRecord
 from service.steps.handheld import failure_words
 from service.web.page.run_frame import limit

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
+from service.computations import board_view, calibrate, further_view, live_view
+from service.computations.calibrate.records import Intrinsics
+from service.computations.records import image_of
 from service.core.protocol.models import Step
 from service.core.records.events import (
     Event,
@@ -21,9 +24,6 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.state import JobState, RunState, StepState, Superseded
-from service.jobs import board_view, calibrate, further_view, live_view
-from service.jobs.calibration_records import Intrinsics
-from service.jobs.records import image_of
 from service.rig import RigSection, parse_recorded_rig
 from service.run_record import RunRecord
 from service.steps.notes import board_plans

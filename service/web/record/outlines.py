@@ -11,6 +11,9 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
+from service.computations import further_view, live_view, locate_spheres
+from service.computations.records import Matrix, SpheresFound
+from service.computations.register import Registration
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_from_record
 from service.compute.poses.camera_files import read_camera_json
@@ -22,9 +25,6 @@ from service.core.units import metres
 from service.dataset.further_cameras import further_pose
 from service.dataset.registrations import best_registration, further_cameras, registrations
 from service.dataset.summary import control_centres, control_scan, registered_scan
-from service.jobs import further_view, live_view, locate_spheres
-from service.jobs.records import Matrix, SpheresFound
-from service.jobs.register import Registration
 from service.run_record import RunRecord
 from service.web.record.images import Capture, further_of
 from service.web.record.pictures import DrawnOutline

@@ -17,6 +17,7 @@ from markupsafe import Markup
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
 
+from service.computations.evaluate import Row
 from service.core.errors import DataError, OrthocaptureError
 from service.core.gates.acceptance import AcceptedGate, accepted_gates
 from service.core.gates.release import loses_release
@@ -24,7 +25,6 @@ from service.core.protocol.models import Reasons, Step
 from service.core.records.entered import NoteTaken, about_rows
 from service.core.records.events import ArtefactRef, ControlTaken, Event, RunStarted
 from service.dataset.registrations import evaluated, shared_adjustment_note
-from service.jobs.evaluate import Row
 from service.monitor.snapshot import STALE_S, read_snapshot
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.control import Control

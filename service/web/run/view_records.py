@@ -8,6 +8,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Protocol as Interface
 
+from service.computations.evaluate import Row
 from service.core.clocks import ClockReading
 from service.core.disk_space import Forecast, size_words
 from service.core.gates.acceptance import AcceptedGate
@@ -18,7 +19,6 @@ from service.core.records.events import Event, GateVerdict, OperatorAction, Oper
 from service.core.recovery import planned_views
 from service.core.run.expected import duration
 from service.core.run.state import Deviation, RunState, StepState
-from service.jobs.evaluate import Row
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
 from service.web.page.run_frame import gate_word, limit

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from service.computations import further_view, fuse
+from service.computations.records import Point
+from service.computations.register import Registration
 from service.compute.evaluation.error_budget import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
@@ -20,9 +23,6 @@ from service.dataset.further_cameras import KnownFurtherCamera, further_poses
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated, viewing_frame
 from service.dataset.summary import registered_scan
-from service.jobs import further_view, fuse
-from service.jobs.records import Point
-from service.jobs.register import Registration
 from service.run_record import RunRecord
 from service.web.record.images import captures_of, further_cameras_of, further_of
 from service.web.record.outlines import (

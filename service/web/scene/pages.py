@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
+from service.computations import fuse
 from service.core.gates.acceptance import accepted_gates
-from service.jobs import fuse
 from service.people.control import Control
 from service.run_acts import drawing_step, read_region, step_to_draw_for
 from service.run_record import RunRecord

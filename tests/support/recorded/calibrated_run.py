@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from service.computations.conversion import hand_eye_record, intrinsics_record
 from service.compute.board.board import BoardView
 from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.intrinsics.estimate import calibrate_intrinsics
@@ -36,7 +37,6 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
-from service.worker.records import hand_eye_record, intrinsics_record
 from tests.support.boards.board_sessions import BOARD, Session, noisy_session
 from tests.support.pages.web import WebSite
 

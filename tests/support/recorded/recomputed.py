@@ -9,10 +9,10 @@ from typing import Any
 
 from service.audit.record.run import RecordedRun
 from service.audit.replay.recomputed import ScratchStore
+from service.computations import register
+from service.computations.job import JobAnswer, JobContext, RecordedContext
 from service.core.jobs import jobs_of, resolve
 from service.core.run.state import JobState
-from service.jobs import register
-from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 
 ARM = ("robot", "robot_corrected")

@@ -14,6 +14,9 @@ import yaml
 from bench.machine import REPOSITORY
 from bench.torture.fuzz.mutations import JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
+from service.computations.conversion import corrected_mounting
+from service.computations.kind import read_part
+from service.computations.records import Mounting
 from service.compute.camera_model import CameraModel
 from service.compute.markers.paper import read_boxes
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
@@ -24,12 +27,9 @@ from service.core.protocol.models import parse_protocol
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList
 from service.core.text.files import parse_json
 from service.import_folder import import_rig
-from service.jobs.kind import read_part
-from service.jobs.records import Mounting
 from service.rig import load_rig
 from service.station import Station
 from service.steps import params_models
-from service.worker.records import corrected_mounting
 
 CAMERA = CameraModel(480, 320, 700.0, 700.0, 239.5, 159.5, -0.05, 0.01)
 MODEL_PARTS = ("cameras", "images", "frames", "points3D", "rigs")

@@ -1,0 +1,166 @@
+"""Job `calibrate`: board images → intrinsics, hand-eye, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from service.computations import calibrate as job
+from service.computations.board_view.compute import board_of, boards_of
+from service.computations.calibrate.records import HandEye, Intrinsics
+from service.computations.conversion import camera_of, camera_record, hand_eye_record, intrinsics_record, seen_board
+from service.computations.job import JobAnswer, JobContext
+from service.computations.records import PosedPhotograph
+from service.compute.arm_kinematics import matching_arm
+from service.compute.board.board import Board
+from service.compute.board.search import UsableViews, usable_views
+from service.compute.camera_model import CameraModel
+from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.hand_eye.reprojection import board_corners
+from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.intrinsics.uncertainty import (
+    MIN_VIEWS_TO_VALIDATE,
+    board_distance_m,
+    calibration_warnings,
+    cross_validate,
+    projection_uncertainty,
+)
+from service.core.errors import DataError
+from service.core.units import metres
+
+
+def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
+    """Find the board in every image, then solve what is asked for."""
+    arguments = context.arguments
+    images = arguments.images
+    names = [image.viewpoint for image in images]
+    board = _board(arguments)
+    found, parts = boards_of(context, board)
+    usable = usable_views(found)
+    seen = usable.indices
+    missed = [names[k] for k in usable.excluded]
+    measures: dict[str, float] = {"views": float(len(seen)), "views_without_board": float(len(missed))}
+    details = job.CalibrationDetails(views_without_board=tuple(missed))
+    if arguments.known is not None:
+        measures["views_partial"] = float(len(parts))
+        details = job.CalibrationDetails(
+            views_without_board=tuple(missed),
+            partial_views={names[k]: count for k, count in parts.items()},
+            reasons={names[k]: reason for k, reason in usable.excluded.items()},
+        )
+    if "intrinsics" in arguments.solve:
+        camera, intrinsics_measures, intrinsics = _intrinsics(usable, board, names)
+        board = seen_board(board, intrinsics.board)
+        details = details.model_copy(update={"intrinsics": intrinsics})
+        measures |= intrinsics_measures
+    elif arguments.camera is not None:
+        camera = camera_of(arguments.camera)
+    else:
+        raise DataError("a hand-eye calibration alone needs the camera's intrinsics")
+    answer = job.Answer(camera=camera_record(camera), details=details)
+    if "hand_eye" in arguments.solve:
+        hand_eye, hand_eye_measures = _hand_eye(images, usable, board, camera)
+        answer = job.Answer(
+            camera=answer.camera,
+            details=details,
+            T_flange_camera=hand_eye.T_flange_camera,
+            T_base_board=hand_eye.T_base_board,
+            hand_eye=hand_eye,
+        )
+        measures |= hand_eye_measures
+    kept = {**answer.plain(), "measures": measures}
+    ref = context.keep_json(kept, kind="calibration", name="calibration.json")
+    return JobAnswer(measures, (ref,), answer)
+
+
+def _board(arguments: job.Arguments) -> Board:
+    """Return the board as the protocol describes it, and bent as the camera's calibration has seen it."""
+    board = board_of(arguments)
+    if arguments.size_tolerance is not None:
+        board = replace(board, size_tolerance=arguments.size_tolerance)
+    if arguments.flatness_mm is not None:
+        board = replace(board, flatness_m=metres(arguments.flatness_mm))
+    return seen_board(board, arguments.seen)
+
+
+def _hand_eye(
+    images: Sequence[PosedPhotograph], usable: UsableViews, board: Board, camera: CameraModel
+) -> tuple[HandEye, dict[str, float]]:
+    """Return the whole record of the hand-eye calibration, and measures."""
+    used = [images[i] for i in usable.indices]
+    T_base_flange = np.array([image.T_base_flange for image in used])
+    T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
+    joints = np.array([image.joints_rad for image in used], dtype=np.float64)
+    arm = matching_arm(joints, T_base_flange) if joints.ndim == 2 else None
+    solved = calibrate_hand_eye(
+        HandEyeViews(
+            T_base_flange,
+            T_camera_board,
+            corners=board_corners(usable.views, board, camera),
+            joints_rad=None if arm is None else joints,
+            arm=arm,
+            board=board,
+        ),
+        T_board_turned=board.half_turn(),
+    )
+    return hand_eye_record(solved, [image.viewpoint for image in used]), _hand_eye_measures(solved)
+
+
+def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
+    best = solved if solved.corrected is None else solved.corrected
+    measures = {
+        # Of the result that the registration uses: with the arm's correction, if there is one.
+        "hand_eye_sigma_mm": best.sigma_mm,
+        "hand_eye_sigma_deg": best.sigma_deg,
+        "hand_eye_held_out_mm": float(np.median(best.held_out_mm)),
+        "hand_eye_held_out_deg": float(np.median(best.held_out_deg)),
+        "hand_eye_uncorrected_held_out_mm": float(np.median(solved.held_out_mm)),
+        "hand_eye_arm_corrected": float(solved.corrected is not None),
+        "hand_eye_excluded": float(len(solved.excluded)),
+        "hand_eye_methods_spread_mm": solved.spread_mm,
+        "hand_eye_condition": solved.condition,
+        "rotation_spread_deg": solved.rotation_spread_deg,
+        "hand_eye_board_size_percent": 100 * (best.size.ratio - 1),
+        "hand_eye_findings": float(len(solved.findings)),
+    }
+    if best.robot_noise_mm is not None and best.robot_noise_deg is not None:
+        measures |= {"robot_noise_mm": best.robot_noise_mm, "robot_noise_deg": best.robot_noise_deg}
+    if solved.corner_sigma_px is not None:
+        measures["corner_sigma_px"] = solved.corner_sigma_px
+    return measures
+
+
+def _intrinsics(
+    usable: UsableViews, board: Board, names: Sequence[str]
+) -> tuple[CameraModel, dict[str, float], Intrinsics]:
+    """Return the camera, measures, and the whole record of the calibration (`intrinsics_record`)."""
+    solved = calibrate_intrinsics(usable.views, board, usable.size)
+    validation = cross_validate(solved) if len(solved.views) >= MIN_VIEWS_TO_VALIDATE else None
+    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
+    excluded = dict(usable.excluded) | {usable.indices[view.index]: view.reason for view in solved.excluded}
+    record = intrinsics_record(
+        solved,
+        validation,
+        uncertainty,
+        calibration_warnings(solved, validation, uncertainty),
+        [names[usable.indices[k]] for k in map(int, solved.views)],
+        {names[k]: excluded[k] for k in sorted(excluded)},
+    )
+    measures = {
+        "views": float(len(solved.views)),
+        "views_excluded": float(len(solved.excluded)),
+        "rms_px": solved.rms_px,
+        "coverage": solved.coverage,
+        "tilt_deg": float(solved.tilt_deg.max()),
+        "uncertainty_px": uncertainty.worst_px,
+        "uncertainty_mm": uncertainty.worst_mm,
+        "uncertainty_centre_mm": uncertainty.centre_mm,
+    }
+    if record.board is not None and record.board.bow_mm is not None:
+        measures["board_bow_mm"] = max(map(abs, record.board.bow_mm))
+    if validation is not None:
+        measures["five_fold_rms_px"] = validation.five_fold_rms_px
+        measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px
+    return solved.camera, measures, record
