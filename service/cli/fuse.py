@@ -20,12 +20,21 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, CommonPart, align, common_part
-from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
-from service.compute.ground_truth.fuse import Fused, FusionSettings, Markers, Source, fuse, without_markers
-from service.compute.ground_truth.heat_map import HeatScale, fusion_picture, write_heat_mesh
-from service.compute.ground_truth.surface import Surface, write_ply
-from service.core.units import metres, mm
+from service.computations.fuse.compute import MEANINGS, FusedMeshes, MeshFusionSettings, fuse_meshes
+from service.compute.ground_truth.align import align
+from service.compute.ground_truth.fuse import Source
+from service.compute.ground_truth.surface import Surface
+from service.core.gates.verdict import judge
+from service.core.protocol.models import Gate
+from service.core.records.events import GateVerdict
+from service.core.units import metres
+
+TRANSPORT_GATE = Gate(
+    measure="sphere_distance_change_max_mm",
+    max=0.3,
+    unit="mm",
+    why="the distances of the spheres must survive the transport",
+)  # as the shipped protocols have it
 
 
 def fuse_command(
@@ -69,79 +78,62 @@ def fuse_command(
         for file, read in ((scan, of_scan), (ct, of_ct)):
             tell_doubt(file, read.findings["polygons_in_doubt"])
         scanned, tomogram = _surface(of_scan), _surface(of_ct)
+        settings = MeshFusionSettings(
+            radius_m=metres(radius_mm),
+            blend_m=metres(blend_mm),
+            spacing_m=metres(spacing_mm),
+            post_radius_m=None if post_radius_mm is None else metres(post_radius_mm),
+            heat_map=heat_map is not None,
+        )
         with progress_bar(quiet=json) as report:
-            report("spheres", 0, 3)
-            aligned = align(tomogram, scanned, metres(radius_mm))
-            tomogram = tomogram.moved(aligned.T_scan_ct)
-            report("distances", 1, 3)
-            common = common_part(tomogram, aligned, metres(radius_mm))
-            score = chamfer(common.ct, scanned, ChamferSettings(metres(spacing_mm), of_vertices=heat_map is not None))
-            report("fusion", 2, 3)
-            fused = _fused(common, scanned, aligned, metres(blend_mm))
-        if post_radius_mm is not None:
-            up = scanned.area_vectors_m2.sum(axis=0)
-            fused = without_markers(
-                fused, Markers(aligned.scan_spheres_m, metres(radius_mm), up, metres(post_radius_mm))
-            )
+            report("spheres", 0, 4)
+            aligned = align(tomogram, scanned, settings.radius_m)
+            found = fuse_meshes(lambda: tomogram, scanned, aligned, settings, report)
         unit_m = METRES_PER_UNIT[of_scan.unit]
-        write_ply(out, fused.surface, unit_m, {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}, _COMMENTS)
-        scale = HeatScale.of(score, ChamferSettings().outlier_m)
-        if heat_map is not None and score.vertex_distance_m is not None:
-            write_heat_mesh(heat_map, common.ct, score.vertex_distance_m, scale, unit_m)
+        found.write_mesh(out, unit_m, [MEANINGS])
+        if heat_map is not None:
+            found.write_heat_map(heat_map, unit_m)
         if picture is not None:
-            write_whole(picture, fusion_picture(common.ct, scanned, score, scale, fused))
-        record = fusion_record(aligned, score, fused)
+            write_whole(picture, found.picture())
+        (verdict,) = judge([TRANSPORT_GATE], found.measures())
+        record = fusion_record(found, verdict)
         if json:
             print_json(record)
         else:
             _show(record)
             console.print(f"written: {out}")
-    if not aligned.passed:
+    if not verdict.passed:
         raise typer.Exit(1)
-
-
-_COMMENTS = ("source 0: CT, 1: scan, 2: blend; sigma along the normal",)
 
 
 def _surface(file: ScannedMesh) -> Surface:
     return Surface(file.mesh.vertices_m, file.mesh.faces.astype(np.int64))
 
 
-def _fused(common: CommonPart, scan: Surface, aligned: Aligned, blend_m: float) -> Fused:
-    # A scan sees its scene from above only: its faces together point up.
-    settings = FusionSettings(
-        blend_m=blend_m,
-        sigma_ct_m=aligned.sigma_ct_m,
-        sigma_scan_m=aligned.sigma_scan_m,
-        alignment_covariance=aligned.covariance,
-        least_part_m2=0.0,  # small parts are left out already
-    )
-    return fuse(common.ct, scan, scan.area_vectors_m2.sum(axis=0), settings, removed=common.taken)
+_SAME_NAMES = ("chamfer_ct_scan_mm", "chamfer_floor_mm", "ct_to_scan_mm", "scan_to_ct_mm")  # as a run has them
 
 
-def fusion_record(aligned: Aligned, score: ChamferScore, fused: Fused) -> dict[str, Any]:
-    """Return what was measured as plain data in millimetres."""
+def fusion_record(found: FusedMeshes, verdict: GateVerdict) -> dict[str, Any]:
+    """Return what was measured as plain data in millimetres, with the verdict on the spheres' distances."""
+    aligned, score, measured = found.aligned, found.score, found.measures()
     return {
-        "spheres": len(aligned.loop.spheres),
-        "spheres_moved": len(aligned.loop.moved),
+        "spheres": int(measured["spheres_compared"]),
+        "spheres_moved": int(measured["spheres_moved"]),
         "taken_away": len(aligned.only_ct),
-        "spheres_rms_mm": mm(aligned.loop.rms_m),
+        "spheres_rms_mm": measured["spheres_rms_mm"],
         "T_scan_ct": aligned.T_scan_ct.tolist(),
-        "distance_change_mm": mm(aligned.distances.worst_m),
-        "distance_change_rms_mm": mm(aligned.distances.rms_m),
-        "distance_change_limit_mm": mm(TRANSPORT_GATE_M),
-        "passed": aligned.passed,
-        "chamfer_ct_scan_mm": mm(score.chamfer_m),
-        "chamfer_floor_mm": mm(score.floor_m),
-        "ct_to_scan_mm": mm(score.pred_to_gt.mean_m),
-        "scan_to_ct_mm": mm(score.gt_to_pred.mean_m),
+        "distance_change_mm": measured["sphere_distance_change_max_mm"],
+        "distance_change_rms_mm": measured["sphere_distance_change_rms_mm"],
+        "distance_change_limit_mm": verdict.maximum,
+        "passed": verdict.passed,
+        **{name: measured[name] for name in _SAME_NAMES},
         "excluded": score.pred_to_gt.excluded + score.gt_to_pred.excluded,
-        "ct_above_scan_mm": mm(fused.ct_offset_m),
-        "share": {source.name.lower(): fused.share(source) for source in Source},
-        "wound_share": float(fused.wound.mean()),
-        "folded_faces": fused.folded,
-        "vertices": len(fused.surface.vertices_m),
-        "faces": len(fused.surface.faces),
+        "ct_above_scan_mm": measured["ct_above_scan_mm"],
+        "share": {source.name.lower(): measured[f"{source.name.lower()}_share"] for source in Source},
+        "wound_share": measured["wound_share"],
+        "folded_faces": int(measured["folded_faces"]),
+        "vertices": int(measured["ground_truth_vertices"]),
+        "faces": int(measured["ground_truth_faces"]),
     }
 
 

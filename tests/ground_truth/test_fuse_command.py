@@ -9,8 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+import yaml
 from typer.testing import CliRunner, Result
 
+from service.cli.common import shipped_protocols
+from service.cli.fuse import TRANSPORT_GATE
 from service.cli.main import app
 from service.core.geometry import Array, apply, inverse
 from tests.support.ct.fused_scene import (
@@ -88,6 +91,17 @@ def test_a_sphere_that_the_scan_lacks_is_cut_out_of_the_ct(tmp_path: Path) -> No
     above = p[np.linalg.norm(p - taken_m, axis=1) < RADIUS_M + 0.0008]
     assert len(above) > 20  # the scan's surface, which the sphere nearly touched
     assert above[:, 2] == pytest.approx(height(above[:, 0], above[:, 1]), abs=1e-4)
+
+
+def test_its_limit_is_the_gate_of_the_shipped_protocols() -> None:
+    steps = [
+        step for file in shipped_protocols().glob("*.yaml") for step in yaml.safe_load(file.read_text())["steps"]
+    ]
+    gates = [gate for step in steps for gate in step.get("gates", ()) if gate["measure"] == TRANSPORT_GATE.measure]
+    assert len(gates) >= 3
+    assert {(gate["max"], gate["unit"], gate["why"]) for gate in gates} == {
+        (TRANSPORT_GATE.max, TRANSPORT_GATE.unit, TRANSPORT_GATE.why)
+    }
 
 
 def test_a_wrong_radius_is_told(tmp_path: Path) -> None:

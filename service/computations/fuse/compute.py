@@ -1,8 +1,13 @@
-"""Job `fuse`: the ground-truth mesh from the CT and the scan, and the checks that both are in one frame."""
+"""Computes the ground-truth mesh from the CT and the scan, and the checks that both are in one frame.
+
+The job `fuse` and the command `orthocapture fuse` both call `fuse_meshes`, and say what its result says.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -30,44 +35,169 @@ from service.core.records.events import ArtefactRef
 from service.core.text.words import SIMULATED
 from service.core.units import deg, metres, mm
 
-_MM = 1e-3  # metres in the unit of the files
-_COMMENTS = ("in the frame of the scan, mm", "source 0: CT, 1: scan, 2: blend; sigma along the normal")
+_MM = 1e-3  # metres in the unit of a job's files
+_FRAME = "in the frame of the scan, mm"
+MEANINGS = "source 0: CT, 1: scan, 2: blend; sigma along the normal"
+_STAGES = 4  # of a fusion, for its progress
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFusionSettings:
+    """The settings of a fusion.
+
+    Attributes:
+        radius_m: the spheres' radius.
+        blend_m: the width of the overlap over which the sources change.
+        spacing_m: the spacing of the samples for the Chamfer distance.
+        post_radius_m: the radius of the spheres' posts, which are then cut out with the spheres; None: no cut.
+        heat_map: true to measure the distance of each of the CT's vertices too, for `write_heat_map`.
+    """
+
+    radius_m: float
+    blend_m: float
+    spacing_m: float
+    post_radius_m: float | None = None
+    heat_map: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class FusedMeshes:
+    """A CT and a scan that were brought into one frame, compared and fused.
+
+    Attributes:
+        aligned: the CT's pose in the frame of the scan, by the spheres.
+        ct: the part of the CT that the scan has too, in the frame of the scan.
+        scan: the scan.
+        score: the distances between the two.
+        fused: the fused mesh.
+        wound_m: (K, 3) outline of the wound's region; empty without a wound.
+    """
+
+    aligned: Aligned
+    ct: Surface = field(repr=False)
+    scan: Surface = field(repr=False)
+    score: ChamferScore
+    fused: Fused
+    wound_m: tuple[Point, ...]
+
+    def measures(self) -> dict[str, float]:
+        """Return what was measured, by the names under which a run records it."""
+        aligned, score, fused = self.aligned, self.score, self.fused
+        return {
+            "spheres_compared": float(len(aligned.loop.spheres)),
+            "spheres_moved": float(len(aligned.loop.moved)),
+            "sphere_distance_change_max_mm": mm(aligned.distances.worst_m),
+            "sphere_distance_change_rms_mm": mm(aligned.distances.rms_m),
+            "spheres_rms_mm": mm(aligned.loop.rms_m),
+            "chamfer_ct_scan_mm": mm(score.chamfer_m),
+            "chamfer_floor_mm": mm(score.floor_m),
+            "ct_to_scan_mm": mm(score.pred_to_gt.mean_m),
+            "scan_to_ct_mm": mm(score.gt_to_pred.mean_m),
+            "ct_to_scan_median_mm": mm(score.pred_to_gt.median_m),
+            "scan_to_ct_median_mm": mm(score.gt_to_pred.median_m),
+            "ct_above_scan_mm": mm(fused.ct_offset_m),
+            "ct_spread_mm": mm(fused.ct_spread_m),
+            **{f"{source.name.lower()}_share": fused.share(source) for source in Source},
+            "wound_share": float(fused.wound.mean()),
+            "sigma_median_mm": mm(float(np.median(fused.sigma_m))),
+            "ground_truth_vertices": float(len(fused.surface.vertices_m)),
+            "ground_truth_faces": float(len(fused.surface.faces)),
+            "folded_faces": float(fused.folded),
+        }
+
+    @property
+    def scale(self) -> HeatScale:
+        """The scale of colours for the distances."""
+        return HeatScale.of(self.score, ChamferSettings().outlier_m)
+
+    def write_mesh(self, path: Path, metres_per_unit: float, comments: Sequence[str] = ()) -> None:
+        """Write the fused mesh as PLY, with the source and the standard deviation of each vertex."""
+        properties = {"source": self.fused.source, "sigma_mm": mm(self.fused.sigma_m)}
+        write_ply(path, self.fused.surface, metres_per_unit, properties, comments)
+
+    def write_heat_map(self, path: Path, metres_per_unit: float, comments: Sequence[str] = ()) -> None:
+        """Write the CT as PLY, coloured by its distance to the scan. Its distances must have been asked for."""
+        assert self.score.vertex_distance_m is not None  # by MeshFusionSettings.heat_map
+        write_heat_mesh(path, self.ct, self.score.vertex_distance_m, self.scale, metres_per_unit, comments)
+
+    def picture(self) -> bytes:
+        """Draw a PNG: CT and scan by their distances, the fused mesh by its sources."""
+        return fusion_picture(self.ct, self.scan, self.score, self.scale, self.fused)
+
+
+def fuse_meshes(
+    read_ct: Callable[[], Surface],
+    scan: Surface,
+    aligned: Aligned,
+    settings: MeshFusionSettings,
+    progress: Callable[[str, int, int], None],
+    corrections: Sequence[RegionCorrection] = (),
+) -> FusedMeshes:
+    """Bring a CT into the frame of a scan, compare both, and fuse them.
+
+    Args:
+        read_ct: returns the CT's mesh in its own frame. Most of its faces may be noise: unless the caller holds it,
+            their memory is freed as soon as they are left out.
+        scan: the scan.
+        aligned: the CT's pose by the spheres of both.
+        settings: the settings of the comparison and of the fusion.
+        progress: called with what is done, how much is done, and the total.
+        corrections: the regions in which people decided which source counts, in the frame of the scan.
+
+    Raises:
+        ComputeError: the two surfaces are nowhere near each other.
+    """
+    up = upwards(scan)
+    progress("distances", 1, _STAGES)
+    common = common_part(read_ct().moved(aligned.T_scan_ct), aligned, settings.radius_m)
+    score = chamfer(
+        common.ct, scan, ChamferSettings(settings.spacing_m, to_faces=False, of_vertices=settings.heat_map)
+    )
+    progress("fusion", 2, _STAGES)
+    fusion = FusionSettings(
+        blend_m=settings.blend_m,
+        sigma_ct_m=aligned.sigma_ct_m,
+        sigma_scan_m=aligned.sigma_scan_m,
+        alignment_covariance=aligned.covariance,
+        least_part_m2=0.0,  # small parts are left out already
+    )
+    fused = fuse_surfaces(common.ct, scan, up, fusion, corrections, common.taken)
+    wound_m = _wound(fused, up)
+    if settings.post_radius_m is not None:
+        markers = Markers(aligned.scan_spheres_m, settings.radius_m, up, settings.post_radius_m)
+        fused = without_markers(fused, markers)
+    progress("pictures", 3, _STAGES)
+    return FusedMeshes(aligned, common.ct, scan, score, fused, wound_m)
+
+
+def upwards(scan: Surface) -> Array:
+    """Return a vector (3,) away from the table: a scan sees its scene from above only, so its faces point up."""
+    return scan.area_vectors_m2.sum(axis=0)
 
 
 @large_arrays_returned()
 def fuse(context: JobContext[job.Arguments]) -> JobAnswer:
-    """Bring the CT into the frame of the scan, compare both, and fuse them."""
+    """Fuse the meshes of a job, and close the loop through the images if there are any."""
     arguments = context.arguments
-    context.progress("spheres", 0, 4)
+    context.progress("spheres", 0, _STAGES)
     aligned = align_spheres(_spheres(arguments.ct), _spheres(arguments.scan))
     scan = Surface.kept(context.input(arguments.scan_mesh))
-    up = scan.area_vectors_m2.sum(axis=0)  # a scan sees its scene from above only: its faces together point up
-    frames = _frames(arguments, aligned)
+    frames, up = _frames(arguments, aligned), upwards(scan)
     corrections = tuple(_correction(region, frames, up) for region in arguments.regions)
-    context.progress("distances", 1, 4)
-    # The whole CT is named nowhere: most of its faces may be noise, and are freed as soon as they are left out.
-    common = common_part(
-        Surface.kept(context.input(arguments.ct_mesh)).moved(aligned.T_scan_ct), aligned, arguments.radius_m
+    settings = MeshFusionSettings(arguments.radius_m, arguments.blend_m, arguments.spacing_m, arguments.post_radius_m)
+    found = fuse_meshes(
+        lambda: Surface.kept(context.input(arguments.ct_mesh)), scan, aligned, settings, context.progress, corrections
     )
-    score = chamfer(common.ct, scan, ChamferSettings(arguments.spacing_m, to_faces=False, of_vertices=True))
-    context.progress("fusion", 2, 4)
-    fused = fuse_surfaces(common.ct, scan, up, _settings(arguments, aligned), corrections, common.taken)
-    wound_m = _wound(fused, up)
-    if arguments.post_radius_m is not None:
-        markers = Markers(aligned.scan_spheres_m, arguments.radius_m, up, arguments.post_radius_m)
-        fused = without_markers(fused, markers)
-    context.progress("pictures", 3, 4)
     loop = _loop(arguments, aligned)
     answer = job.Answer(
         T_scan_ct=matrix(aligned.T_scan_ct),
         covariance=matrix(aligned.covariance),
         T_scan_ct_by_images=None if loop is None else matrix(loop.T_scan_scan @ aligned.T_scan_ct),
-        wound_m=wound_m,
+        wound_m=found.wound_m,
         regions=arguments.regions,
         taken_away=aligned.only_ct,
     )
-    files = _files(context, _ComparedSurfaces(common.ct, scan, score), fused)
-    return JobAnswer(_measures(aligned, loop, score, fused), files, answer)
+    return JobAnswer(found.measures() | _loop_measures(loop), _files(context, found), answer)
 
 
 def _spheres(found: SpheresFound) -> MeshSpheres:
@@ -76,16 +206,6 @@ def _spheres(found: SpheresFound) -> MeshSpheres:
         np.array(found.spheres_m),
         np.array([sphere.covariance_m2 for sphere in details]),
         metres(np.array([sphere.rms_mm for sphere in details])),
-    )
-
-
-def _settings(arguments: job.Arguments, aligned: Aligned) -> FusionSettings:
-    return FusionSettings(
-        blend_m=arguments.blend_m,
-        sigma_ct_m=aligned.sigma_ct_m,
-        sigma_scan_m=aligned.sigma_scan_m,
-        alignment_covariance=aligned.covariance,
-        least_part_m2=0.0,  # small parts are left out already
     )
 
 
@@ -136,56 +256,23 @@ def _loop(arguments: job.Arguments, aligned: Aligned) -> TransformLoop | None:
     return close_transforms(aligned.T_scan_ct, T_world_scan, T_world_ct, aligned.scan_spheres_m)
 
 
-@dataclass(frozen=True, slots=True)
-class _ComparedSurfaces:
-    """CT and scan in the scan's frame, and their distances."""
-
-    ct: Surface
-    scan: Surface
-    score: ChamferScore
-
-
-def _files(context: JobContext[job.Arguments], compared: _ComparedSurfaces, fused: Fused) -> tuple[ArtefactRef, ...]:
-    scale = HeatScale.of(compared.score, ChamferSettings().outlier_m)
-    mesh, heat = context.scratch / "ground_truth.ply", context.scratch / "ct_to_scan.ply"
-    properties = {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}
-    mark = [SIMULATED] if context.arguments.simulated else []
-    write_ply(mesh, fused.surface, _MM, properties, [*_COMMENTS, *mark])
-    assert compared.score.vertex_distance_m is not None  # asked for above
-    write_heat_mesh(heat, compared.ct, compared.score.vertex_distance_m, scale, _MM, mark)
-    picture = fusion_picture(compared.ct, compared.scan, compared.score, scale, fused)
-    return (
-        context.keep_file(mesh, kind="ground_truth_mesh", media_type="model/ply"),
-        context.keep_file(heat, kind="fusion_heat_map", media_type="model/ply"),
-        context.keep_bytes(picture, kind="fusion_picture", media_type="image/png", name="fusion.png"),
-    )
-
-
-def _measures(aligned: Aligned, loop: TransformLoop | None, score: ChamferScore, fused: Fused) -> dict[str, float]:
-    around = {} if loop is None else {
+def _loop_measures(loop: TransformLoop | None) -> dict[str, float]:
+    if loop is None:
+        return {}
+    return {
         "loop_closure_mm": mm(loop.worst_m),
         "loop_closure_rms_mm": mm(loop.rms_m),
         "loop_closure_deg": deg(loop.rotation_rad),
-    }  # fmt: skip
-    return {
-        "spheres_compared": float(len(aligned.loop.spheres)),
-        "spheres_moved": float(len(aligned.loop.moved)),
-        "sphere_distance_change_max_mm": mm(aligned.distances.worst_m),
-        "sphere_distance_change_rms_mm": mm(aligned.distances.rms_m),
-        "spheres_rms_mm": mm(aligned.loop.rms_m),
-        **around,
-        "chamfer_ct_scan_mm": mm(score.chamfer_m),
-        "chamfer_floor_mm": mm(score.floor_m),
-        "ct_to_scan_mm": mm(score.pred_to_gt.mean_m),
-        "scan_to_ct_mm": mm(score.gt_to_pred.mean_m),
-        "ct_to_scan_median_mm": mm(score.pred_to_gt.median_m),
-        "scan_to_ct_median_mm": mm(score.gt_to_pred.median_m),
-        "ct_above_scan_mm": mm(fused.ct_offset_m),
-        "ct_spread_mm": mm(fused.ct_spread_m),
-        **{f"{source.name.lower()}_share": fused.share(source) for source in Source},
-        "wound_share": float(fused.wound.mean()),
-        "sigma_median_mm": mm(float(np.median(fused.sigma_m))),
-        "ground_truth_vertices": float(len(fused.surface.vertices_m)),
-        "ground_truth_faces": float(len(fused.surface.faces)),
-        "folded_faces": float(fused.folded),
     }
+
+
+def _files(context: JobContext[job.Arguments], found: FusedMeshes) -> tuple[ArtefactRef, ...]:
+    mesh, heat = context.scratch / "ground_truth.ply", context.scratch / "ct_to_scan.ply"
+    mark = [SIMULATED] if context.arguments.simulated else []
+    found.write_mesh(mesh, _MM, [_FRAME, MEANINGS, *mark])
+    found.write_heat_map(heat, _MM, mark)
+    return (
+        context.keep_file(mesh, kind="ground_truth_mesh", media_type="model/ply"),
+        context.keep_file(heat, kind="fusion_heat_map", media_type="model/ply"),
+        context.keep_bytes(found.picture(), kind="fusion_picture", media_type="image/png", name="fusion.png"),
+    )

@@ -55,7 +55,7 @@ class DistanceChange:
 
     Attributes:
         worst: the two spheres whose distance changed most.
-        worst_m: size of that change, which the gate judges.
+        worst_m: size of that change.
         rms_m: root mean square of all changes.
     """
 
@@ -83,9 +83,6 @@ def distance_changes(before_m: Array, after_m: Array, pairs: Sequence[tuple[int,
     change = np.linalg.norm(b[first] - b[second], axis=1) - np.linalg.norm(a[first] - a[second], axis=1)
     worst = int(np.abs(change).argmax())
     return DistanceChange(both[worst], float(np.abs(change[worst])), float(np.sqrt(np.mean(change**2))))
-
-
-TRANSPORT_GATE_M = 3e-4  # largest change of a distance between spheres over the transport
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +118,6 @@ class Aligned:
     scan_spheres_m: Array = field(repr=False)
     sigma_ct_m: float
     sigma_scan_m: float
-
-    @property
-    def passed(self) -> bool:
-        """True if no distance changed by more than the gate allows."""
-        return self.distances.worst_m <= TRANSPORT_GATE_M
 
 
 def align(ct: Surface, scan: Surface, radius_m: float) -> Aligned:
