@@ -34,8 +34,8 @@ from service.computations import develop, features, match, merge_scans
 from service.computations.job import JobContext, RecordedContext, handler_of
 from service.computations.kind import JobKind
 from service.compute.images.develop_parameters import PARAMETERS
-from service.compute.resources import keep_freed_memory
 from service.core.units import megabytes
+from service.machine.resources import keep_freed_memory
 from simulators.rendering.sensor import bordered, camera_picture, read_out
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import Scene

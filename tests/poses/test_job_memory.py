@@ -14,9 +14,9 @@ from service.computations import job_kinds
 from service.computations.job import JobAnswer, RecordedContext
 from service.computations.kind import Demand
 from service.computations.memory_grants import Grant, MemoryGrants, waiting_for_memory
-from service.compute.resources import MachineMemory, machine_memory, processes_for
 from service.core.errors import ComputeError, IllegalTransitionError
 from service.core.records.events import JobFailed
+from service.machine.resources import MachineMemory, machine_memory, processes_for
 from service.store.records import LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity
 from service.store.store import Store

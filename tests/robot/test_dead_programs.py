@@ -56,10 +56,8 @@ def moving(name: str, folder: Path) -> Generator[tuple[Program, WorldWatch]]:
         try:
             assert program.next("error")["error"] == "LeaveNeededError"
             assert watch.moved_for_s(watch.mark()) == 0.0, "it does not move for nobody"
-            program.let_move("Ada")
             begun_s = watch.mark()
-            program.next("moves_to")
-            watch.wait_moving(begun_s, FULL_SPEED_AFTER_S)
+            program.go_on("Ada", lambda: watch.moved_for_s(begun_s) >= FULL_SPEED_AFTER_S)
             yield program, watch
         finally:
             program.close()
@@ -83,8 +81,8 @@ def test_killed(name: str, victim: str, tmp_path: Path) -> None:
         comes_to_rest(watch, since_s, lateness)
         rested_s = watch.mark()
         if victim == "driver":  # the program reopens it and tries to continue, again and again
-            assert program.next("error")["error"] == "DriverKilledError"
-            assert program.next("error")["error"] == "LeaveNeededError"
+            program.fails_with("DriverKilledError")
+            program.fails_with("LeaveNeededError")
             stays(watch, rested_s)
             goes_on_for_a_person(program, watch)
         else:
@@ -101,8 +99,7 @@ def test_stopped_and_continued(name: str, victim: str, tmp_path: Path) -> None:
         comes_to_rest(watch, since_s, lateness)
         again_s = watch.mark()
         program.send((victim, signal.SIGCONT))
-        while program.next("error")["error"] != "LeaveNeededError":
-            pass  # at first its stream is old
+        program.fails_with("LeaveNeededError")  # at first its stream is old
         stays(watch, again_s)
         goes_on_for_a_person(program, watch)
 
@@ -115,6 +112,4 @@ def stays(watch: WorldWatch, since_s: float) -> None:
 
 def goes_on_for_a_person(program: Program, watch: WorldWatch) -> None:
     since_s = watch.mark()
-    program.let_move("Grace")
-    program.next("moves_to")
-    watch.wait_moving(since_s, 0.5)
+    program.go_on("Grace", lambda: watch.moved_for_s(since_s) >= 0.5)

@@ -33,8 +33,7 @@ def moving(number: int, *, hangs: bool = False, unattended_s: float = 5.0) -> Ge
         try:
             assert program.next("error")["error"] == "LeaveNeededError"
             assert arm.moved_for_s(1) == 0.0, "it does not move for nobody"
-            program.let_move("Ada")
-            arm.wait_moving(0.95)
+            program.go_on("Ada", lambda: arm.now.speed_rad_s >= 0.95)
             yield program, arm
         finally:
             program.close()
@@ -67,8 +66,8 @@ def test_killed(victims: tuple[str, ...]) -> None:
         comes_to_rest(arm, since, lateness)
         rested = arm.mark()
         if victims == ("driver",):  # the program reopens it and tries to continue, again and again
-            assert program.next("error")["error"] == "DriverKilledError"
-            assert "since it was connected" in program.next("error")["message"]
+            program.fails_with("DriverKilledError")
+            assert "since it was connected" in program.fails_with("LeaveNeededError")["message"]
             arm.pass_s(STAYS_S)
             assert arm.moved_for_s(rested) == 0.0
             goes_on_for_a_person(program, arm)
@@ -78,8 +77,7 @@ def test_killed(victims: tuple[str, ...]) -> None:
 
 
 def goes_on_for_a_person(program: Program, arm: ArmWatch) -> None:
-    program.let_move("Grace")
-    arm.wait_moving(0.5)
+    program.go_on("Grace", lambda: arm.now.speed_rad_s >= 0.5)
 
 
 @pytest.mark.parametrize("victim", ["program", "driver"])
@@ -90,9 +88,7 @@ def test_stopped_and_continued(victim: str) -> None:
         comes_to_rest(arm, since, lateness)
         again = arm.mark()
         program.send((victim, signal.SIGCONT))
-        error = program.next("error")
-        assert error["error"] == "LeaveNeededError"
-        assert "gave no sign of life" in error["message"]
+        assert "gave no sign of life" in program.fails_with("LeaveNeededError")["message"]
         arm.pass_s(STAYS_S)  # in which the program tries again and again
         assert arm.moved_for_s(again) == 0.0, "it moves on by itself"
         goes_on_for_a_person(program, arm)
@@ -116,7 +112,6 @@ def test_a_short_lapse_at_rest_needs_nobody() -> None:
             program.send(("driver", signal.SIGSTOP))
             arm.wait_stopped(since)
             program.send(("driver", signal.SIGCONT))
-            program.let_move("Ada")
-            arm.wait_moving(0.5)
+            program.go_on("Ada", lambda: arm.now.speed_rad_s >= 0.5)
         finally:
             program.close()

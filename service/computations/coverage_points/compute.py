@@ -10,7 +10,7 @@ from service.computations import coverage_points as coverage_job
 from service.computations.job import JobAnswer, JobContext
 from service.computations.scene import limits_of
 from service.compute.planning.coverage import coverage_surface
-from service.compute.resources import large_arrays_returned
+from service.machine.resources import large_arrays_returned
 
 
 @large_arrays_returned()

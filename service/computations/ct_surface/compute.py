@@ -9,7 +9,6 @@ import numpy as np
 from service.computations import ct_surface as ct_job
 from service.computations.job import JobAnswer, JobContext
 from service.computations.locate_spheres.compute import search_spheres
-from service.compute.resources import large_arrays_returned
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import (
     LEAST_CONTRAST_HU,
@@ -22,6 +21,7 @@ from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm
+from service.machine.resources import large_arrays_returned
 
 
 @large_arrays_returned()

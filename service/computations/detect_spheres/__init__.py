@@ -14,7 +14,7 @@ from service.computations.records import (
     Point,
     PosedPhotograph,
 )
-from service.compute.resources import IMAGE_MB, processes_for
+from service.machine.resources import IMAGE_MB, processes_for
 
 DetectorName = Literal["classical", "paper", "grounded", "vote"]
 

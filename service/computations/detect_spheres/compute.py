@@ -21,9 +21,9 @@ from service.compute.markers.image_files import LocatedOutlines, detect_all, loc
 from service.compute.markers.paper import detect_file_by_masks
 from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
 from service.compute.markers.refine import remeasure_file
-from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
+from service.machine.resources import IMAGE_MB, processes_for
 
 
 def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:

@@ -9,7 +9,7 @@ from pydantic import Field
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import PosedPhotograph, SpheresFound
 from service.computations.register import Registration
-from service.compute.resources import IMAGE_MB, processes_for
+from service.machine.resources import IMAGE_MB, processes_for
 
 
 class Arguments(JobRecord):

@@ -41,13 +41,13 @@ from service.compute.pixels.resample import resample
 from service.compute.registration.common_errors import UNEXPLAINED
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.compute.registration.identity import Assignment
-from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
 from service.core.records.events import ArtefactRef
 from service.core.units import metres, mm
+from service.machine.resources import IMAGE_MB, processes_for
 
 _COMMON = ("common", INTRINSICS, UNEXPLAINED)  # components that move all spheres equally
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import Camera, Hash, ImageFile, Matrix, ParameterCovariance, Point
-from service.compute.resources import IMAGE_MB, processes_for
+from service.machine.resources import IMAGE_MB, processes_for
 
 
 class FirstCamera(JobRecord):

@@ -27,11 +27,11 @@ from service.compute.registration.further_camera import (
     sighted_pose,
 )
 from service.compute.registration.pose_errors import of_inverse, of_product
-from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
 from service.core.units import mm, mrad
+from service.machine.resources import IMAGE_MB, processes_for
 
 
 def further_camera(context: JobContext[job.Arguments]) -> JobAnswer:

@@ -28,12 +28,12 @@ from service.compute.ground_truth.fuse import fuse as fuse_surfaces
 from service.compute.ground_truth.heat_map import HeatScale, fusion_picture, write_heat_mesh
 from service.compute.ground_truth.overlap import Box, Prism, RegionCorrection, outline, seen_along
 from service.compute.ground_truth.surface import Surface, write_ply
-from service.compute.resources import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import ArtefactRef
 from service.core.text.words import SIMULATED
 from service.core.units import deg, metres, mm
+from service.machine.resources import large_arrays_returned
 
 _MM = 1e-3  # metres in the unit of a job's files
 _FRAME = "in the frame of the scan, mm"

@@ -14,13 +14,13 @@ from service.computations.records import LoopClosure as LoopClosureRecord
 from service.computations.records import SphereChange, SphereDetails, SpheresFound, matrix
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
-from service.compute.resources import large_arrays_returned
 from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
 from service.compute.surfaces.mesh_spheres import MeshSphere, wrong_unit
 from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm
+from service.machine.resources import large_arrays_returned
 
 
 @large_arrays_returned()

@@ -9,11 +9,11 @@ from service.computations import merge_scans as merge_job
 from service.computations.job import JobAnswer, JobContext
 from service.computations.locate_spheres.compute import found_spheres, search_spheres
 from service.computations.records import matrix
-from service.compute.resources import large_arrays_returned
 from service.compute.surfaces.constellations import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import apply
 from service.core.units import mm
+from service.machine.resources import large_arrays_returned
 
 
 @large_arrays_returned()

@@ -41,8 +41,8 @@ def main() -> None:
         try:
             if persons:
                 name, asked_s = persons.pop()
-                arm.let_move(name, asked_s)
-                say(let_by=name)
+                said = None
+                _let_move(arm, name, asked_s)
             target = arm.state().sample.joints_rad.copy()
             target[0] = goals_rad[0]
             arm.move_joints(target, speed_rad_s=speed_rad_s, acceleration_rad_s2=acceleration_rad_s2)
@@ -62,6 +62,15 @@ def main() -> None:
             time.sleep(0.1)
             if isinstance(error, DeviceUnavailableError):
                 _opened(arm)
+
+
+def _let_move(arm: RobotArm, name: str, asked_s: float) -> None:
+    try:
+        arm.let_move(name, asked_s)
+    except DeviceError as error:
+        say(let_by=None, message=str(error))
+        raise
+    say(let_by=name)
 
 
 def _opened(arm: RobotArm) -> bool:
