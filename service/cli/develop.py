@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json as json_module
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder, write_whole
-from service.compute.images.develop import Developed, develop, encode_tiff
+from service.computations.develop.compute import DevelopedFile, develop_file
 from service.compute.images.develop_parameters import PARAMETERS
-from service.compute.images.photographs import read_image
 from service.core.errors import ConfigurationError, DataError
 
 _JPEGS = (".jpg", ".jpeg")
@@ -37,7 +36,7 @@ def develop_command(
         for file in files:
             jpeg = _jpeg_of(file)
             parameters = replace(PARAMETERS, demosaic=demosaic)
-            made = develop(file, None if jpeg is None else read_image(jpeg), parameters)
+            made = develop_file(file, jpeg, parameters)
             records.append(_write(made, file, jpeg, out))
             if not json:
                 _tell(records[-1], jpeg)
@@ -65,15 +64,14 @@ def _jpeg_of(raw: Path) -> Path | None:
     return min(beside, default=None)
 
 
-def _write(made: Developed, raw: Path, jpeg: Path | None, out: Path) -> dict[str, Any]:
-    data = encode_tiff(made.image_bgr)
+def _write(made: DevelopedFile, raw: Path, jpeg: Path | None, out: Path) -> dict[str, Any]:
     out.mkdir(exist_ok=True)
-    write_whole(out / f"{raw.stem}.tif", data)
+    write_whole(out / f"{raw.stem}.tif", made.tiff)
     record: dict[str, Any] = {
         "raw": _named(raw.name, raw.read_bytes()),
         "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
-        "tiff": _named(f"{raw.stem}.tif", data),
-        **asdict(made.how),
+        "tiff": _named(f"{raw.stem}.tif", made.tiff),
+        **made.plain(),
     }
     write_whole(out / f"{raw.stem}.json", json_module.dumps(record, indent=1) + "\n")
     return record

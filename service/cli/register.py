@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -25,21 +25,19 @@ from service.cli.common import (
     write_whole,
 )
 from service.cli.spheres import SeedsOption, spheres_of
+from service.computations.detect_spheres import DetectorName
+from service.computations.detect_spheres.compute import detector_of, search_outlines
 from service.compute.camera_model import read_camera_covariance
 from service.compute.evaluation.control_spheres import LEAST_SHARE, MOST_WORST_MM, ExpectedNearby
 from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for
-from service.compute.markers.grounded import GroundedDetector
 from service.compute.markers.grounded_networks import VARIABLE, weights_in
 from service.compute.markers.image_files import (
     DetectFile,
     LocatedOutlines,
-    detect_all,
-    locate_outlines,
     search_nearby,
-    searched_whole,
 )
-from service.compute.markers.paper import detect_file_by_masks, read_boxes
+from service.compute.markers.paper import read_boxes
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json
@@ -53,7 +51,6 @@ from service.core.records.events import GateVerdict
 from service.core.units import metres, mm
 
 _MOST_MM = 0.35  # the paper's mean radial error
-DetectorName = Literal["classical", "paper", "grounded", "vote"]
 
 
 def register_command(
@@ -144,18 +141,17 @@ def register_command(
         posed = PosedImages(T_world_camera, model, metric=not estimate_scale, names=names)
         scanned = ScanSpheres(registration_m, radius_m, control_m=control_m)
         with progress_bar(quiet=json) as progress:
-
-            def show(done: int, total: int) -> None:
-                progress("spheres in images", done, total)
-
-            if full_search or detector != "classical":
-                # One process has the networks, which use all cores by themselves.
-                searchers = 1 if detector in ("grounded", "vote") else processes
-                located = searched_whole(detect_all(files, model, options, searchers, show, detect=detect))
-            else:
-                # Control spheres take no part in choosing outlines: they are searched for once the poses are known.
-                chosen = ScanSpheres(registration_m, radius_m)
-                located = locate_outlines(files, posed, chosen, options=options, workers=processes, progress=show)
+            # Control spheres take no part in choosing outlines: they are searched for once the poses are known.
+            located = search_outlines(
+                files,
+                model,
+                None if full_search else posed,
+                ScanSpheres(registration_m, radius_m),
+                detect=detect,
+                options=options,
+                workers=processes,
+                progress=partial(progress, "spheres in images"),
+            )
 
             def search(expected: ExpectedNearby) -> Sequence[Sequence[SphereOutline]]:
                 tasks = [(files[i], around) for i, around in expected]
@@ -233,12 +229,9 @@ def _file_detector(
     """Return the detector for one file, None for the default, and the hashes of its weights, if it has any."""
     if boxes is not None and detector != "paper":
         raise typer.BadParameter("--boxes needs --detector paper")
-    if detector == "paper":
-        return partial(detect_file_by_masks, boxes=None if boxes is None else read_boxes(boxes, names)), {}
-    if detector == "classical":
-        return None, {}
-    weights = weights_in(folder)
-    return GroundedDetector.of(weights, least, vote=detector == "vote"), weights.sha256()
+    weights = weights_in(folder) if detector in ("grounded", "vote") else None
+    found = detector_of(detector, weights, least, None if boxes is None else read_boxes(boxes, names))
+    return found, {} if weights is None else weights.sha256()
 
 
 def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""What several jobs begin with: photographs as files, and camera poses from those of the robot."""
+"""What several jobs begin with: photographs as files, nominal cameras, and camera poses from those of the robot."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from service.computations.records import ArmCorrection, ImageFile, ImagesCamera,
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
 from service.compute.pixels.resample import resample
+from service.core.errors import DataError
 from service.core.geometry import Array
 from service.machine.processes import mapping
 from service.machine.resources import IMAGE_MB, processes_for
@@ -53,6 +54,21 @@ def _reduce(files: tuple[Path, Path], full: CameraModel, width: int, height: int
     original, copy = files
     _, data = cv2.imencode(".jpg", resample(read_image(original), full, width, height), _JPEG)
     copy.write_bytes(data.tobytes())
+
+
+def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: float) -> CameraModel:
+    """Return nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
+
+    Raises:
+        DataError: the file does not state its focal length.
+    """
+    if not focal_mm > 0:
+        raise DataError(
+            "the photograph does not state its focal length",
+            remedy="Use a lens that reports it to the camera, or check the layout with `orthocapture layout --photo`",
+        )
+    focal_px = focal_mm / sensor_width_mm * width
+    return CameraModel(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0)
 
 
 def robot_camera_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> Array:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from service.computations import calibrate as job
-from service.computations.board_view.compute import board_of, boards_of
-from service.computations.calibrate.records import HandEye, Intrinsics
+from service.computations.board_view import Corners
+from service.computations.board_view.compute import board_of, read_corners
+from service.computations.calibrate.records import HandEye, Intrinsics, KnownBoard
 from service.computations.conversion import camera_of, camera_record, hand_eye_record, intrinsics_record, seen_board
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import PosedPhotograph
 from service.compute.arm_kinematics import matching_arm
 from service.compute.board.board import Board
-from service.compute.board.search import UsableViews, usable_views
+from service.compute.board.knowledge import BoardKnowledge
+from service.compute.board.search import BoardImage, UsableViews, find_boards, usable_views, with_parts
 from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.compute.hand_eye.reprojection import board_corners
+from service.compute.images.photographs import read_grey
 from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.intrinsics.uncertainty import (
     MIN_VIEWS_TO_VALIDATE,
@@ -37,7 +41,7 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
     images = arguments.images
     names = [image.viewpoint for image in images]
     board = _board(arguments)
-    found, parts = boards_of(context, board)
+    found, parts = _boards(context, board)
     usable = usable_views(found)
     seen = usable.indices
     missed = [names[k] for k in usable.excluded]
@@ -73,6 +77,62 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
     kept = {**answer.plain(), "measures": measures}
     ref = context.keep_json(kept, kind="calibration", name="calibration.json")
     return JobAnswer(measures, (ref,), answer)
+
+
+def _boards(context: JobContext[job.Arguments], board: Board) -> tuple[tuple[BoardImage, ...], dict[int, int]]:
+    """Find the board in every image of a job, and count the corners in images that show a part of it.
+
+    Images that `board_view` has searched are not searched again. Parts of the board are used if camera, mount and
+    board are known well enough (`known`).
+    """
+    arguments = context.arguments
+    images = arguments.images
+    looked = arguments.corners or [None] * len(images)
+    search = [k for k, sha256 in enumerate(looked) if sha256 is None]
+    files = [context.input(images[k].sha256) for k in search]
+    searched = dict(
+        zip(
+            search,
+            find_boards(
+                files,
+                board,
+                workers=os.cpu_count() or 1,
+                progress=lambda done, total: context.progress("board images", done, total),
+            ),
+            strict=True,
+        )
+    )
+    found = tuple(
+        searched[k] if sha256 is None else read_corners(Corners.model_validate(context.input_json(sha256)))
+        for k, sha256 in enumerate(looked)
+    )
+    if arguments.known is None or board.pattern != "checkerboard":
+        return found, {}
+    known = _knowledge(arguments.known)
+    greys = [
+        read_grey(context.input(image.sha256)) if one.view is None and one.size != (0, 0) else None
+        for image, one in zip(images, found, strict=True)
+    ]
+    flanges = np.array([image.T_base_flange for image in images])
+    whole = with_parts(found, greys, board, known, flanges)
+    parts = {
+        k: len(now.view.indices)
+        for k, (before, now) in enumerate(zip(found, whole, strict=True))
+        if before.view is None and now.view is not None
+    }
+    return whole, parts
+
+
+def _knowledge(known: KnownBoard) -> BoardKnowledge:
+    return BoardKnowledge(
+        camera_of(known.camera),
+        np.array(known.T_flange_camera),
+        np.array(known.T_base_board),
+        np.array(known.spread),
+        known.focal,
+        known.centre,
+        known.measured,
+    )
 
 
 def _board(arguments: job.Arguments) -> Board:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,15 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.detect import options_for
 from service.compute.markers.grounded import GroundedDetector
 from service.compute.markers.grounded_networks import Weights, weights_in
-from service.compute.markers.image_files import LocatedOutlines, detect_all, locate_outlines, searched_whole
-from service.compute.markers.paper import detect_file_by_masks
-from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
+from service.compute.markers.image_files import (
+    DetectFile,
+    LocatedOutlines,
+    detect_all,
+    locate_outlines,
+    searched_whole,
+)
+from service.compute.markers.paper import Box, detect_file_by_masks
+from service.compute.markers.records import DetectionOptions, SphereOutline, outline_from_record, outline_record
 from service.compute.markers.refine import remeasure_file
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
@@ -98,35 +106,80 @@ def _located(
     weights: Weights | None,
 ) -> LocatedOutlines:
     arguments = context.arguments
-    files = photographs(context, images)
-    workers = processes_for(len(files), IMAGE_MB)
-
-    def show(done: int, total: int) -> None:
-        context.progress("spheres in images", done, total)
-
-    options = options_for(arguments.colour)
-    camera = camera_used(arguments)
-    if weights is not None:
-        networks = GroundedDetector.of(weights, len(arguments.spheres_m), vote=arguments.detector == "vote")
-        return searched_whole(detect_all(files, camera, options, 1, show, detect=networks))
-    if arguments.detector == "paper":
-        return searched_whole(detect_all(files, camera, options, workers, show, detect=detect_file_by_masks))
-    if poses is None and not has_poses(arguments, images):
-        return searched_whole(detect_all(files, camera, options, workers, show))
-    return locate_outlines(
-        files,
-        PosedImages(
+    files, camera = photographs(context, images), camera_used(arguments)
+    posed = None
+    if arguments.detector == "classical" and (poses is not None or has_poses(arguments, images)):
+        posed = PosedImages(
             robot_camera_poses(arguments, images) if poses is None else poses,
             camera,
             groups=_numbered(image.station for image in images),
             metric=poses is None,
-        ),
+        )
+    return search_outlines(
+        files,
+        camera,
+        posed,
         ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m),
+        detect=detector_of(arguments.detector, weights, len(arguments.spheres_m)),
         scenes=_numbered(image.step for image in images),
-        options=options,
-        workers=workers,
-        progress=show,
+        options=options_for(arguments.colour),
+        workers=processes_for(len(files), IMAGE_MB),
+        progress=partial(context.progress, "spheres in images"),
     )
+
+
+def detector_of(
+    name: job.DetectorName,
+    weights: Weights | None,
+    least: int,
+    boxes: Mapping[str, Sequence[Box]] | None = None,
+) -> DetectFile | None:
+    """Return a detector for single files, which searches whole images; None for the classical one.
+
+    Args:
+        name: the detector's name.
+        weights: those of the networks, for `grounded` and `vote`.
+        least: the number of spheres below which the networks' threshold falls.
+        boxes: those of another detector by file name, for `paper`; None: it finds them itself.
+    """
+    if name == "paper":
+        return partial(detect_file_by_masks, boxes=boxes)
+    return None if weights is None else GroundedDetector.of(weights, least, vote=name == "vote")
+
+
+def search_outlines(
+    files: Sequence[Path],
+    camera: CameraModel,
+    posed: PosedImages | None,
+    spheres: ScanSpheres,
+    *,
+    detect: DetectFile | None,
+    options: DetectionOptions,
+    workers: int,
+    progress: Callable[[int, int], None],
+    scenes: Sequence[int] | None = None,
+) -> LocatedOutlines:
+    """Search the outlines of the spheres in images: where their poses predict them, or everywhere.
+
+    Args:
+        files: N images of the camera's size.
+        camera: their camera.
+        posed: their poses; None: the images are searched whole.
+        spheres: the spheres that the poses predict.
+        detect: a detector that searches whole images; None: the classical one.
+        options: the detector's options.
+        workers: the number of processes.
+        progress: called with the number of images done and of all.
+        scenes: (N,) images of the same number show the same spheres; None: all do.
+
+    Raises:
+        DataError: an image cannot be used.
+    """
+    if detect is not None or posed is None:
+        # One process has the networks, which use all cores by themselves.
+        at_once = 1 if isinstance(detect, GroundedDetector) else workers
+        return searched_whole(detect_all(files, camera, options, at_once, progress, detect=detect))
+    return locate_outlines(files, posed, spheres, scenes=scenes, options=options, workers=workers, progress=progress)
 
 
 def _numbered(names: Iterable[str]) -> list[int]:

@@ -1,28 +1,54 @@
-"""Job `develop`: a raw file, developed with the recorded parameters."""
+"""Develops a raw file with fixed parameters; job and command `develop` both call `develop_file`."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import cv2
 
-from service.computations import develop as develop_job
+from service.computations import develop as job
 from service.computations.job import JobAnswer, JobContext
-from service.compute.images.develop import develop, encode_tiff
+from service.compute.images.develop import Development, develop, encode_tiff
 from service.compute.images.develop_parameters import DevelopParameters
 from service.compute.images.photographs import read_image
 
 
-def develop_raw(context: JobContext[develop_job.Arguments]) -> JobAnswer:
-    """Develop the raw file with the recorded parameters."""
+@dataclass(frozen=True, slots=True)
+class DevelopedFile:
+    """A linear TIFF of 16 bits, and how it was made."""
+
+    tiff: bytes = field(repr=False)
+    how: Development
+
+    def plain(self) -> dict[str, Any]:
+        """Return how it was made as plain data, as a run and a command record it."""
+        return asdict(self.how)
+
+
+def develop_file(raw: Path, jpeg: Path | None, parameters: DevelopParameters) -> DevelopedFile:
+    """Develop a raw file.
+
+    Args:
+        raw: the raw file.
+        jpeg: the JPEG of the same exposure, which gives the picture its size and checks its place; None without one.
+        parameters: the parameters.
+
+    Raises:
+        DataError: a file cannot be used, or the two do not show the same.
+        ConfigurationError: rawpy is not installed, or does not know a parameter.
+    """
+    made = develop(raw, None if jpeg is None else read_image(jpeg), parameters)
+    return DevelopedFile(encode_tiff(made.image_bgr), made.how)
+
+
+def develop_raw(context: JobContext[job.Arguments]) -> JobAnswer:
+    """Develop the raw file of a job with the recorded parameters."""
     cv2.setNumThreads(1)
     arguments = context.arguments
     parameters = DevelopParameters(**arguments.parameters.model_dump())
-    jpeg = read_image(context.input(arguments.jpeg))
-    made = develop(context.input(arguments.raw), jpeg, parameters)
-    tiff = context.keep_bytes(
-        encode_tiff(made.image_bgr), kind="developed", media_type="image/tiff", name=f"{arguments.viewpoint}.tif"
-    )
-    answer = develop_job.Answer.model_validate({**asdict(made.how), "raw": arguments.raw})
-    largest = 0.0 if made.how.largest_shift_px is None else made.how.largest_shift_px
-    return JobAnswer({"largest_shift_px": largest}, (tiff,), answer)
+    made = develop_file(context.input(arguments.raw), context.input(arguments.jpeg), parameters)
+    tiff = context.keep_bytes(made.tiff, kind="developed", media_type="image/tiff", name=f"{arguments.viewpoint}.tif")
+    answer = job.Answer.model_validate({**made.plain(), "raw": arguments.raw})
+    return JobAnswer({"largest_shift_px": made.how.largest_shift_px or 0.0}, (tiff,), answer)

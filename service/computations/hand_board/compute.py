@@ -7,8 +7,8 @@ import numpy as np
 
 from service.computations import hand_board as job
 from service.computations.hand_view.answer import NewImage, answer_to, read_views
+from service.computations.inputs import nominal_camera
 from service.computations.job import JobAnswer, JobContext
-from service.computations.layout.compute import nominal_camera
 from service.computations.scene import CaptureScene, limits_of
 from service.compute.board.board import Board, find_board
 from service.compute.images.photographs import read_grey

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.computations import layout as job
 from service.computations.conversion import judged_layout
+from service.computations.inputs import nominal_camera
 from service.computations.job import JobAnswer, JobContext
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
@@ -25,7 +26,7 @@ from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
 from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
-from service.core.errors import ComputeError, DataError
+from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm
 
@@ -96,21 +97,6 @@ def _not_wider(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
         return image
     size = (width, round(image.shape[0] * width / image.shape[1]))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: float) -> CameraModel:
-    """Return nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
-
-    Raises:
-        DataError: the file does not state its focal length.
-    """
-    if not focal_mm > 0:
-        raise DataError(
-            "the photograph does not state its focal length",
-            remedy="Use a lens that reports it to the camera, or check the layout with `orthocapture layout --photo`",
-        )
-    focal_px = focal_mm / sensor_width_mm * width
-    return CameraModel(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0)
 
 
 def _moves(
