@@ -23,24 +23,16 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
+from service.computations.calibrate.compute import CalibratedCamera, calibrate_camera
 from service.computations.calibrate.records import Intrinsics
-from service.computations.conversion import intrinsics_record
 from service.compute.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
 from service.compute.board.search import UsableViews, find_boards, probe_board, usable_views
 from service.compute.images.photographs import image_folder, image_size
 from service.compute.intrinsics.adjustment import LensModel
-from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
+from service.compute.intrinsics.estimate import IntrinsicsResult
 from service.compute.intrinsics.optics import Optics, compare_optics, states_focus, summary
 from service.compute.intrinsics.plots import calibration_plots
-from service.compute.intrinsics.uncertainty import (
-    MIN_VIEWS_TO_VALIDATE,
-    CrossValidation,
-    ProjectionUncertainty,
-    board_distance_m,
-    calibration_warnings,
-    cross_validate,
-    projection_uncertainty,
-)
+from service.compute.intrinsics.uncertainty import ProjectionUncertainty
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.text.words import counted
 from service.core.units import metres, mm
@@ -189,26 +181,19 @@ def intrinsics_command(
             require_writable_folder(report)
         views = searched(files, seen, quiet=json)
         try:
-            result = calibrate_intrinsics(views.views, seen, views.size, model=model)
+            found = calibrate_camera(views, seen, model=model, distance_m=distance_m)
         except ComputeError as error:
             raise _with_reasons(error, views, files) from error
-        validation = cross_validate(result) if len(result.views) >= MIN_VIEWS_TO_VALIDATE else None
-        uncertainty = projection_uncertainty(result, board_distance_m(result) if distance_m is None else distance_m)
-        used = [views.indices[k] for k in result.views]
-        excluded = dict(views.excluded) | {views.indices[view.index]: view.reason for view in result.excluded}
-        optics, departures = _optics([files[k] for k in used], capture_images)
-        warnings = [*calibration_warnings(result, validation, uncertainty), *departures]
-        names = [files[k].name for k in used]
-        left_out = folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)}
-        stated = intrinsics_record(result, validation, uncertainty, warnings, names, left_out)
-        record: dict[str, Any] = {**result.camera.record(), **stated.plain(), "optics": optics}
+        optics, departures = _optics([files[k] for k in found.used], capture_images)
+        stated = found.record([file.name for file in files], left_out=folder.left_out, warnings=departures)
+        record: dict[str, Any] = {**found.result.camera.record(), **stated.plain(), "optics": optics}
         write_whole(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
         if report is not None:
-            _write_plots(report, result, uncertainty)
+            _write_plots(report, found.result, found.uncertainty)
         if json:
             print_json(record)
             return
-        _tell(stated, result, validation, uncertainty)
+        _tell(stated, found)
         console.print(f"written: {out}")
 
 
@@ -279,12 +264,8 @@ def _write_plots(folder: Path, result: IntrinsicsResult, uncertainty: Projection
         raise DataError(f"the report cannot be written: {error.strerror}", where=str(folder)) from error
 
 
-def _tell(
-    record: Intrinsics,
-    result: IntrinsicsResult,
-    validation: CrossValidation | None,
-    uncertainty: ProjectionUncertainty,
-) -> None:
+def _tell(record: Intrinsics, found: CalibratedCamera) -> None:
+    result, validation, uncertainty = found.result, found.validation, found.uncertainty
     held_out = "" if validation is None else f", {validation.five_fold_rms_px:.3f} px held out"
     console.print(f"{counted(len(result.views), 'view')}, {result.rms_px:.3f} px rms{held_out}")
     for name in result.parameters:

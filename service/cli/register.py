@@ -32,11 +32,7 @@ from service.compute.evaluation.control_spheres import LEAST_SHARE, MOST_WORST_M
 from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for
 from service.compute.markers.grounded_networks import VARIABLE, weights_in
-from service.compute.markers.image_files import (
-    DetectFile,
-    LocatedOutlines,
-    search_nearby,
-)
+from service.compute.markers.image_files import DetectFile, LocatedOutlines, search_nearby
 from service.compute.markers.paper import read_boxes
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,9 +23,12 @@ from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.compute.hand_eye.reprojection import board_corners
 from service.compute.images.photographs import read_grey
-from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.intrinsics.adjustment import LensModel
+from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics, locate_view
 from service.compute.intrinsics.uncertainty import (
     MIN_VIEWS_TO_VALIDATE,
+    CrossValidation,
+    ProjectionUncertainty,
     board_distance_m,
     calibration_warnings,
     cross_validate,
@@ -55,10 +58,13 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
             reasons={names[k]: reason for k, reason in usable.excluded.items()},
         )
     if "intrinsics" in arguments.solve:
-        camera, intrinsics_measures, intrinsics = _intrinsics(usable, board, names)
+        calibrated = calibrate_camera(usable, board)
+        camera, intrinsics = calibrated.result.camera, calibrated.record(names)
         board = seen_board(board, intrinsics.board)
         details = details.model_copy(update={"intrinsics": intrinsics})
-        measures |= intrinsics_measures
+        measures |= calibrated.measures()
+        if intrinsics.board is not None and intrinsics.board.bow_mm is not None:
+            measures["board_bow_mm"] = max(map(abs, intrinsics.board.bow_mm))
     elif arguments.camera is not None:
         camera = camera_of(arguments.camera)
     else:
@@ -192,35 +198,87 @@ def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
     return measures
 
 
-def _intrinsics(
-    usable: UsableViews, board: Board, names: Sequence[str]
-) -> tuple[CameraModel, dict[str, float], Intrinsics]:
-    """Return the camera, measures, and the whole record of the calibration (`intrinsics_record`)."""
-    solved = calibrate_intrinsics(usable.views, board, usable.size)
-    validation = cross_validate(solved) if len(solved.views) >= MIN_VIEWS_TO_VALIDATE else None
-    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
-    excluded = dict(usable.excluded) | {usable.indices[view.index]: view.reason for view in solved.excluded}
-    record = intrinsics_record(
-        solved,
+@dataclass(frozen=True, slots=True)
+class CalibratedCamera:
+    """A camera that was calibrated from images of a board, and how far it is to be trusted.
+
+    Attributes:
+        result: the calibration.
+        validation: its cross-validation; None if there are too few images.
+        uncertainty: the uncertainty of a projected point.
+        warnings: sentences on the images.
+        used: the numbers of the images used, in the order of `result.views`.
+        excluded: the reason, by number of an image that was not used.
+    """
+
+    result: IntrinsicsResult
+    validation: CrossValidation | None
+    uncertainty: ProjectionUncertainty
+    warnings: tuple[str, ...]
+    used: tuple[int, ...]
+    excluded: Mapping[int, str]
+
+    def record(
+        self, names: Sequence[str], *, left_out: Mapping[str, str] | None = None, warnings: Sequence[str] = ()
+    ) -> Intrinsics:
+        """Return the whole record of the calibration.
+
+        Args:
+            names: the names of all images.
+            left_out: the reason, by name of an image that was not even searched.
+            warnings: further sentences.
+        """
+        return intrinsics_record(
+            self.result,
+            self.validation,
+            self.uncertainty,
+            [*self.warnings, *warnings],
+            [names[k] for k in self.used],
+            {**(left_out or {}), **{names[k]: self.excluded[k] for k in sorted(self.excluded)}},
+        )
+
+    def measures(self) -> dict[str, float]:
+        """Return what was measured, by the names under which a run records it."""
+        result, validation = self.result, self.validation
+        measures = {
+            "views": float(len(result.views)),
+            "views_excluded": float(len(result.excluded)),
+            "rms_px": result.rms_px,
+            "coverage": result.coverage,
+            "tilt_deg": float(result.tilt_deg.max()),
+            "uncertainty_px": self.uncertainty.worst_px,
+            "uncertainty_mm": self.uncertainty.worst_mm,
+            "uncertainty_centre_mm": self.uncertainty.centre_mm,
+        }
+        if validation is not None:
+            measures["five_fold_rms_px"] = validation.five_fold_rms_px
+            measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px
+        return measures
+
+
+def calibrate_camera(
+    usable: UsableViews, board: Board, *, model: LensModel = "opencv4", distance_m: float | None = None
+) -> CalibratedCamera:
+    """Calibrate a camera, validate it, and propagate its errors to the specimen.
+
+    Args:
+        usable: the views of the board.
+        board: the board.
+        model: the model of the lens.
+        distance_m: the specimen's distance, for the uncertainty; None: the board's.
+
+    Raises:
+        DataError: a view's corners do not belong to this board.
+        ComputeError: too few views, or tilts so similar that the focal length is undetermined.
+    """
+    result = calibrate_intrinsics(usable.views, board, usable.size, model=model)
+    validation = cross_validate(result) if len(result.views) >= MIN_VIEWS_TO_VALIDATE else None
+    uncertainty = projection_uncertainty(result, board_distance_m(result) if distance_m is None else distance_m)
+    return CalibratedCamera(
+        result,
         validation,
         uncertainty,
-        calibration_warnings(solved, validation, uncertainty),
-        [names[usable.indices[k]] for k in map(int, solved.views)],
-        {names[k]: excluded[k] for k in sorted(excluded)},
+        calibration_warnings(result, validation, uncertainty),
+        used=tuple(usable.indices[k] for k in map(int, result.views)),
+        excluded=dict(usable.excluded) | {usable.indices[view.index]: view.reason for view in result.excluded},
     )
-    measures = {
-        "views": float(len(solved.views)),
-        "views_excluded": float(len(solved.excluded)),
-        "rms_px": solved.rms_px,
-        "coverage": solved.coverage,
-        "tilt_deg": float(solved.tilt_deg.max()),
-        "uncertainty_px": uncertainty.worst_px,
-        "uncertainty_mm": uncertainty.worst_mm,
-        "uncertainty_centre_mm": uncertainty.centre_mm,
-    }
-    if record.board is not None and record.board.bow_mm is not None:
-        measures["board_bow_mm"] = max(map(abs, record.board.bow_mm))
-    if validation is not None:
-        measures["five_fold_rms_px"] = validation.five_fold_rms_px
-        measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px
-    return solved.camera, measures, record

@@ -10,16 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.computations.conversion import hand_eye_record, intrinsics_record
+from service.computations.calibrate.compute import calibrate_camera
+from service.computations.conversion import hand_eye_record
 from service.compute.board.board import BoardView
+from service.compute.board.search import UsableViews
 from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.intrinsics.estimate import calibrate_intrinsics
-from service.compute.intrinsics.uncertainty import (
-    board_distance_m,
-    calibration_warnings,
-    cross_validate,
-    projection_uncertainty,
-)
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import (
@@ -124,27 +119,22 @@ def _calibrated() -> tuple[Session, dict[str, Any], dict[str, float]]:
     every = np.arange(len(session.corners.points_m))
     views = [BoardView(every, pixels) for pixels in session.corners.corners_px]
     camera = session.corners.camera
-    solved = calibrate_intrinsics(views, BOARD, (camera.width, camera.height))
-    validation = cross_validate(solved)
-    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
-    warnings = calibration_warnings(solved, validation, uncertainty)
-    used = [_NAMES[k] for k in map(int, solved.views)]
-    excluded = {_NAMES[view.index]: view.reason for view in solved.excluded}
+    usable = UsableViews((camera.width, camera.height), tuple(range(len(views))), tuple(views), {})
+    calibrated = calibrate_camera(usable, BOARD)
     hands = calibrate_hand_eye(
         HandEyeViews(session.T_base_flange, session.T_camera_board, corners=session.corners), bootstrap=10
     )
     hand_eye = hand_eye_record(hands, _NAMES).plain()
     result: dict[str, Any] = {
-        "camera": solved.camera.record(),
+        "camera": calibrated.result.camera.record(),
         "T_flange_camera": hand_eye["T_flange_camera"],
         "T_base_board": hand_eye["T_base_board"],
         "hand_eye": hand_eye,
         "robots": ["robot"],
-        "details": {
-            "intrinsics": intrinsics_record(solved, validation, uncertainty, warnings, used, excluded).plain()
-        },
+        "details": {"intrinsics": calibrated.record(_NAMES).plain()},
     }
-    return session, result, {"rms_px": solved.rms_px, "hand_eye_held_out_mm": float(np.median(hands.held_out_mm))}
+    measures = {"rms_px": calibrated.result.rms_px, "hand_eye_held_out_mm": float(np.median(hands.held_out_mm))}
+    return session, result, measures
 
 
 def capture(
