@@ -28,7 +28,7 @@ from service.cli.spheres import SeedsOption, spheres_of
 from service.computations.detect_spheres import DetectorName
 from service.computations.detect_spheres.compute import detector_of, search_outlines
 from service.compute.camera_model import read_camera_covariance
-from service.compute.evaluation.control_spheres import LEAST_SHARE, MOST_WORST_MM, ExpectedNearby
+from service.compute.evaluation.control_spheres import LEAST_SHARE, ExpectedNearby
 from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for
 from service.compute.markers.grounded_networks import VARIABLE, weights_in
@@ -47,6 +47,7 @@ from service.core.records.events import GateVerdict
 from service.core.units import metres, mm
 
 _MOST_MM = 0.35  # the paper's mean radial error
+_MOST_WORST_MM = 0.5  # radial error of one control sphere
 
 
 def register_command(
@@ -192,7 +193,7 @@ def _gates(result: PipelineResult) -> list[Gate]:
     return [
         *gates,
         Gate(measure="best_mean_radial_error_mm", max=_MOST_MM, unit="mm", why="the paper's figure"),
-        Gate(measure="worst_control_sphere_mm", max=MOST_WORST_MM, unit="mm", why="a mean hides one that was moved"),
+        Gate(measure="worst_control_sphere_mm", max=_MOST_WORST_MM, unit="mm", why="a mean hides one that was moved"),
         Gate(measure="control_outlines_share", min=LEAST_SHARE, unit="", why="what no image shows confirms nothing"),
     ]
 

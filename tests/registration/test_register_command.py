@@ -14,9 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
+from service.cli.common import shipped_protocols
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.poses.camera_files import write_camera_json
@@ -154,6 +156,16 @@ def test_spheres_and_csv(capture: Capture, record: dict[str, Any]) -> None:
     sigma_m = np.sqrt(np.diag(record["covariance"]))
     assert sigma_m.shape == (6,)
     assert np.all((sigma_m > 1e-7) & (sigma_m < 1e-2))
+
+
+@pytest.mark.slow
+def test_its_limits_of_control_spheres_are_the_gates_of_the_shipped_protocol(record: dict[str, Any]) -> None:
+    protocol = yaml.safe_load((shipped_protocols() / "exvivo_spine.yaml").read_text())
+    gates = [gate for step in protocol["steps"] if step["id"] == "evaluation" for gate in step["gates"]]
+    limits = {gate["measure"]: (gate.get("min"), gate.get("max")) for gate in gates}
+    own = {gate["measure"]: (gate["minimum"], gate["maximum"]) for gate in record["gates"]}
+    both = ("best_mean_radial_error_mm", "worst_control_sphere_mm", "control_outlines_share")
+    assert [own[measure] for measure in both] == [limits[measure] for measure in both]
 
 
 @pytest.mark.slow
@@ -350,7 +362,6 @@ def test_wrong_usage_has_status_2(capture: Capture, tmp_path: Path, changes: dic
     assert words in result.output
 
 
-@pytest.mark.slow
 def test_the_papers_detector_takes_the_boxes_of_another(capture: Capture, few: Path, tmp_path: Path) -> None:
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps({"DSC00001.JPG": [[10, 10, 5, 20]]}))

@@ -20,7 +20,6 @@ from service.core.geometry import Array, inverse
 from service.core.text.words import counted
 from service.core.units import mm
 
-MOST_WORST_MM = 0.5  # radial error of one control sphere, where the paper's mean over all is 0.35
 LEAST_SHARE = 0.5  # of the outlines of one control sphere that should be seen
 _NEAR_RADII = 1.0  # around a place that the images agree on, where the outlines that lack are searched
 _FOUND_SHARE = 0.3  # of a capture's images: in a capture that shows no control sphere in so many, none was placed
