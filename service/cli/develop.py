@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json as json_module
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,7 +71,7 @@ def _write(made: DevelopedFile, raw: Path, jpeg: Path | None, out: Path) -> dict
         "raw": _named(raw.name, raw.read_bytes()),
         "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
         "tiff": _named(f"{raw.stem}.tif", made.tiff),
-        **made.plain(),
+        **asdict(made.how),
     }
     write_whole(out / f"{raw.stem}.json", json_module.dumps(record, indent=1) + "\n")
     return record

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 
@@ -21,10 +20,6 @@ class DevelopedFile:
 
     tiff: bytes = field(repr=False)
     how: Development
-
-    def plain(self) -> dict[str, Any]:
-        """Return how it was made as plain data, as a run and a command record it."""
-        return asdict(self.how)
 
 
 def develop_file(raw: Path, jpeg: Path | None, parameters: DevelopParameters) -> DevelopedFile:
@@ -50,5 +45,5 @@ def develop_raw(context: JobContext[job.Arguments]) -> JobAnswer:
     parameters = DevelopParameters(**arguments.parameters.model_dump())
     made = develop_file(context.input(arguments.raw), context.input(arguments.jpeg), parameters)
     tiff = context.keep_bytes(made.tiff, kind="developed", media_type="image/tiff", name=f"{arguments.viewpoint}.tif")
-    answer = job.Answer.model_validate({**made.plain(), "raw": arguments.raw})
+    answer = job.Answer.model_validate({**asdict(made.how), "raw": arguments.raw})
     return JobAnswer({"largest_shift_px": made.how.largest_shift_px or 0.0}, (tiff,), answer)
