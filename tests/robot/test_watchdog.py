@@ -24,12 +24,12 @@ GOAL_RAD = 2.5
 
 
 @contextlib.contextmanager
-def moving(number: int, *, hangs: bool = False, unattended_s: float = 5.0) -> Generator[tuple[Program, ArmWatch]]:
+def moving(number: int, *, unattended_s: float = 5.0) -> Generator[tuple[Program, ArmWatch]]:
     """An arm at full speed, and the program that drives it."""
     host = address(number)
     with simulated_ur(host, patience_s=0), watched_arm(host) as arm:
         config = UrConfig(host=host, unattended_s=unattended_s)
-        program = Program("drivers.ur:DRIVER", config, (GOAL_RAD, -GOAL_RAD), hangs=hangs)
+        program = Program("drivers.ur:DRIVER", config, (GOAL_RAD, -GOAL_RAD))
         try:
             assert program.next("error")["error"] == "LeaveNeededError"
             assert arm.moved_for_s(1) == 0.0, "it does not move for nobody"
@@ -95,8 +95,10 @@ def test_stopped_and_continued(victim: str) -> None:
 
 
 def test_a_program_that_lives_but_no_longer_looks_at_its_moving_arm() -> None:
-    with moving(72, hangs=True, unattended_s=0.8) as (_, arm), Lateness() as lateness:
-        comes_to_rest(arm, arm.mark(), lateness, 0.8 + AT_REST_WITHIN_S)
+    with moving(72, unattended_s=0.8) as (program, arm), Lateness() as lateness:
+        since = arm.mark()
+        program.hang()
+        comes_to_rest(arm, since, lateness, 0.8 + AT_REST_WITHIN_S)
         assert arm.now.joints_rad[0] < GOAL_RAD - 0.5, "it was stopped on its way"
 
 

@@ -29,7 +29,6 @@ class Program:
         spec, config: the driver.
         goals_rad: between which its first joint moves.
         motion: its speed (rad/s) and acceleration (rad/s²); the fastest motion of protocols/demo.yaml by default.
-        hangs: its main loop hangs once the arm moves.
     """
 
     def __init__(
@@ -39,10 +38,9 @@ class Program:
         goals_rad: tuple[float, float],
         *,
         motion: tuple[float, float] = (1.0, 1.5),
-        hangs: bool = False,
     ) -> None:
         numbers = map(str, (*goals_rad, *motion))
-        words = (spec, config.model_dump_json(), *numbers, "hangs" if hangs else "lives")
+        words = (spec, config.model_dump_json(), *numbers)
         self._process = Forked(
             [sys.executable, "-m", "tests.support.processes.stubborn_program", *words],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -63,14 +61,16 @@ class Program:
 
     def let_move(self, person: str) -> None:
         """Let the arm move for a person; again while it is refused because the stream is old, say."""
-        assert self._process.stdin is not None
         until_s = time.monotonic() + _WITHIN_S
         told: dict[str, Any] = {}
         while told.get("let_by") != person:
             assert time.monotonic() < until_s, told
-            self._process.stdin.write(person + "\n")
-            self._process.stdin.flush()
+            self._tell(person)
             told = self.next("let_by")
+
+    def hang(self) -> None:
+        """Let its main loop hang as soon as the arm moves."""
+        self._tell("hang")
 
     def go_on(self, person: str, moving: Callable[[], bool]) -> None:
         """Let the arm move until it does, once more when this machine's lapse has taken the leave away."""
@@ -120,6 +120,11 @@ class Program:
             with contextlib.suppress(OSError):
                 if pipe is not None:
                     pipe.close()
+
+    def _tell(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
 
     def _has_lost_leave(self) -> bool:
         lost = False
