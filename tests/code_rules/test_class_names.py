@@ -36,5 +36,5 @@ def test_a_public_class_has_a_name_of_its_own() -> None:
 
 
 def _twins(modules: list[str]) -> bool:
-    """Whether a record of a job writes down the class of the computation that has its name."""
-    return [module.split("/")[0] for module in modules] == ["compute", "jobs"]
+    """Whether a record of a job writes down the class of the numerics that has its name."""
+    return [module.split("/")[0] for module in modules] == ["computations", "compute"]
