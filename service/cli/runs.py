@@ -10,9 +10,11 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from service.audit.filters import RESULTS, RunSearch
+from service.audit.record.rows import plain
 from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
 from service.audit.runs.history import history, history_csv
-from service.audit.runs.search import RESULT_WORDS, RESULTS, FoundRun, RunSearch, find_runs
+from service.audit.runs.search import RESULT_WORDS, FoundRun, find_runs
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -46,7 +48,7 @@ def runs_command(
     """List the recorded runs, newest first: all, or those that match."""
     if result and result not in RESULTS:
         raise typer.BadParameter(f"{result!r} is not one of {', '.join(RESULTS)}", param_hint="--result")
-    wanted = RunSearch(search, _day(since, "--since"), _day(until, "--until"), result)
+    wanted = RunSearch(q=plain(search), since=_day(since, "--since"), until=_day(until, "--until"), result=result)
     with reporting_errors(json), Store.open(data, create=False) as store:
         found = find_runs(store, wanted)
     if json:

@@ -5,44 +5,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Connection, text
 
+from service.audit.filters import ArtefactFilter, EventFilter
 from service.audit.record.rows import LARGEST_SEQ, PAGE, EventRow, head, plain, read_rows
 from service.store.records import UnknownRunError
-
-
-@dataclass(frozen=True, slots=True)
-class Filter:
-    """Base of filters, whose fields are texts; an empty field matches all."""
-
-    @property
-    def active(self) -> bool:
-        """True if any filter is set."""
-        return bool(self.query())
-
-    def query(self) -> dict[str, str]:
-        """Return the filter as query parameters of a link."""
-        return {name: value for name, value in asdict(self).items() if value}
-
 
 COUNT_LIMIT = 10_000  # matches of a filter beyond this number are not counted
 _SEARCH_CHARACTERS = 200
 _SEARCH_TERMS = 8
 _WORD = re.compile(r"[^\W_]")
-
-
-@dataclass(frozen=True, slots=True)
-class EventFilter(Filter):
-    """A filter for events; an empty field matches all."""
-
-    step: str = ""
-    device: str = ""
-    person: str = ""
-    kind: str = ""
-    q: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,17 +191,6 @@ class Facets:
 
 
 _LARGEST_PAGE = 10**6
-
-
-@dataclass(frozen=True, slots=True)
-class ArtefactFilter(Filter):
-    """A filter for artefacts; an empty field matches all."""
-
-    kind: str = ""
-    step: str = ""
-    device: str = ""
-    viewpoint: str = ""
-    q: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from typing import Literal
 
 from sqlalchemy import Connection, text
 
-from service.audit.runs.search import FoundRun, RunSearch, find_runs
+from service.audit.filters import RunSearch
+from service.audit.runs.search import FoundRun, find_runs
 from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_identity, recorded_optics
 from service.store.store import Store
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, text
 
+from service.audit.filters import Result, RunSearch
 from service.core.records.entered import RunAbout
 from service.core.records.events import GatesEvaluated
 from service.store.records import SITE
 from service.store.runs import read_open_runs
 from service.store.store import Store
 
-Result = Literal["open", "completed", "aborted", "within", "outside", "released"]
-RESULTS: tuple[Result, ...] = get_args(Result)
 RESULT_WORDS: Mapping[Result, str] = {
     "open": "not ended",
     "completed": "completed",
@@ -27,26 +26,6 @@ RESULT_WORDS: Mapping[Result, str] = {
     "released": "released",
 }
 _ERROR = "mean_radial_error_mm"  # the measure of an evaluation that is shown as the accuracy of the run
-
-
-@dataclass(frozen=True, slots=True)
-class RunSearch:
-    """A search; an empty field matches every run."""
-
-    q: str = ""  # words that must all occur in what people wrote about the run
-    since: str = ""  # 2026-11-21, in UTC
-    until: str = ""
-    result: str = ""  # one of RESULTS
-
-    @property
-    def active(self) -> bool:
-        """True if any field is set."""
-        return any((self.q.strip(), self.since, self.until, self.result))
-
-    def query(self) -> dict[str, str]:
-        """Return the search as query parameters of a link."""
-        fields = {"q": self.q, "since": self.since, "until": self.until, "result": self.result}
-        return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,11 @@ from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
-from pydantic import BaseModel, Field
+from pydantic import Field
 
+from service.audit.filters import RunSearch
 from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
-from service.audit.runs.search import RESULT_WORDS, RESULTS, RunSearch, find_runs
+from service.audit.runs.search import RESULT_WORDS, find_runs
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.gates.measure_names import measure_name
 from service.core.protocol.models import LoadedProtocol, Protocol, irreversible_warning, load_protocol
@@ -66,18 +67,10 @@ class StartableProtocol:
     changes: tuple[str, ...] = ()  # changes against the approved content of its id and version
 
 
-class HomeQuery(BaseModel):
-    """Page number and search of the first page."""
+class HomeQuery(RunSearch):
+    """A page of the runs, or of those that match a search."""
 
     page: int = Field(1, ge=1, le=100_000)
-    q: str = Field("", max_length=200)
-    since: str = Field("", max_length=200)
-    until: str = Field("", max_length=200)
-    result: str = Field("", max_length=200)
-
-    def wanted(self) -> RunSearch:
-        """Return the search."""
-        return RunSearch(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
 
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
@@ -85,17 +78,16 @@ def home(
     request: Request,
     site: CurrentSite,
     person: SignedInPerson,
-    asked_for: Annotated[HomeQuery, Query()],
+    wanted: Annotated[HomeQuery, Query()],
 ) -> HTMLResponse:
     """Show the runs in progress, then those that have ended, newest first, or those that match a search.
 
     Only the runs of the page shown are read whole.
     """
-    wanted = asked_for.wanted()
     found = {run.run_id: run for run in find_runs(site.store, wanted)}
     rows = _in_order(site, found)
     pages = max(1, -(-len(rows) // _PAGE))
-    page = min(asked_for.page, pages)
+    page = min(wanted.page, pages)
     lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
     asked = person.may("operate") and not wanted.active
     startable = [startable_of(path.name, site) for path in site.protocol_files()] if asked else []
