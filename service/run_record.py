@@ -15,6 +15,7 @@ from service.core.jobs import arguments_name, job_key
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import ArtefactRef, Event, Payload, RecordedView, RunStarted
 from service.core.run.decide import advance, fold
+from service.core.run.folded import FoldedRun
 from service.core.run.state import JobState, RunState, lane_of
 from service.core.text.words import time_here
 from service.jobs import term
@@ -48,14 +49,10 @@ def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
 
 
 @dataclass(frozen=True, slots=True)
-class RunRecord:
-    """The record of one run at one moment: its events and their fold, which belong together."""
+class RunRecord(FoldedRun):
+    """The record of one run at one moment, and the store that holds its files and jobs."""
 
     store: Store
-    run_id: str
-    protocol: Protocol
-    events: tuple[Event, ...]
-    state: RunState
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
         """Return the valid captures of a step's current attempt, in the order of capture."""
@@ -100,7 +97,7 @@ class RunFollower:
         with self._reading:
             state = self._read()
             if self._log is None or self._log.state is not state:
-                self._log = RunRecord(self.store, self.run_id, self.protocol, tuple(self._events), state)
+                self._log = RunRecord(self.run_id, self.protocol, tuple(self._events), state, self.store)
             return self._log
 
     def _read(self) -> RunState:

@@ -145,10 +145,8 @@ _PARTS = ("about", "accuracy", "gates", "calibration", "durations", "measures")
 
 def _compared(store: Store, name: str) -> ComparedRun:
     run_id = store.find_run(name)
-    protocol, root = recorded_run(store, run_id)
-    source = store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
-    log = read_log(store, run_id, protocol)
-    return ComparedRun(run_id, root, protocol, source, log.events, log.state)
+    protocol, _ = recorded_run(store, run_id)
+    return ComparedRun.of(read_log(store, run_id, protocol))
 
 
 def _comparison_record(comparison: RunComparison) -> dict[str, object]:

@@ -16,8 +16,9 @@ from service.compute.ground_truth.surface import read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply
 from service.core.protocol.models import Protocol
-from service.core.records.events import ArtefactRef, Event, JobFinished, RecordedView, RunStarted
+from service.core.records.events import ArtefactRef, JobFinished, RecordedView
 from service.core.run.fold import fold
+from service.core.run.folded import FoldedRun
 from service.core.run.state import JobState, RunState
 from service.core.units import metres
 from service.dataset.registrations import (
@@ -83,14 +84,9 @@ class GroundTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class RunSummary:
-    """The record of one run."""
+class RunSummary(FoldedRun):
+    """The record of one run, and what reads its files."""
 
-    run_id: str
-    protocol: Protocol
-    root: RunStarted
-    state: RunState
-    events: Sequence[Event]
     store: ArtefactReader
 
     def registrations(self) -> Mapping[str, Registration]:
@@ -168,9 +164,7 @@ class RunSummary:
 def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:
     """Read a run and fold its events."""
     events = store.events(run_id)
-    root = events[0].payload
-    assert isinstance(root, RunStarted)  # service.run_start has checked it
-    return RunSummary(run_id, protocol, root, fold(protocol, events), events, store)
+    return RunSummary(run_id, protocol, events, fold(protocol, events), store)
 
 
 MESH = "ground_truth_mesh"  # kind of the mesh's artefact

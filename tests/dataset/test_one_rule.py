@@ -66,7 +66,7 @@ def store(run: RecordedRun) -> Iterator[Store]:
 
 
 def page_of(run: RecordedRun, store: Store) -> RunRecord:
-    return RunRecord(store, run.run_id, run.protocol, tuple(run.events), run.state)
+    return RunRecord(run.run_id, run.protocol, tuple(run.events), run.state, store)
 
 
 def test_every_reader_takes_the_registration_that_the_evaluation_judged_best(run: RecordedRun, store: Store) -> None:

@@ -12,13 +12,12 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import Field
 
 from service.audit.filters import RunSearch
-from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
+from service.audit.runs.comparison import ComparedRun, compare_runs
 from service.audit.runs.search import RESULT_WORDS, find_runs
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.gates.measure_names import measure_name
 from service.core.protocol.models import LoadedProtocol, Protocol, irreversible_warning, load_protocol
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
-from service.core.records.events import RunStarted
 from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
@@ -178,7 +177,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
         robot=robot,
         standing=standing,
         why=why,
-        about=root.about or RunAbout() if isinstance(root := log.events[0].payload, RunStarted) else RunAbout(),
+        about=log.root.about or RunAbout(),
     )
 
 
@@ -244,9 +243,7 @@ def protocol_checklist(
 def run_checklist(request: Request, site: CurrentSite, run_id: Annotated[str, Path(max_length=64)]) -> HTMLResponse:
     """Show the checklist of the protocol that a run began with."""
     log = site.run(run_id)
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the run was read
-    return _page(request, log.protocol, root.protocol_sha256, run_id=run_id, frame=run_frame(site, run_id))
+    return _page(request, log.protocol, log.root.protocol_sha256, run_id=run_id, frame=run_frame(site, run_id))
 
 
 def _page(
@@ -279,7 +276,7 @@ def compare_page(
 ) -> HTMLResponse:
     """Show two runs, or the choice of two. Raises UnknownRunError."""
     chosen = list(dict.fromkeys(run or []))
-    comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
+    comparison = compare_runs(*(ComparedRun.of(site.run(run_id)) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]
     missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
     return render(
@@ -291,10 +288,3 @@ def compare_page(
         missing=missing,
         measure_name=measure_name,
     )
-
-
-def _run(site: Site, run_id: str) -> ComparedRun:
-    log = site.run(run_id)
-    root = root_of(log.events)
-    source = site.store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
-    return ComparedRun(run_id, root, log.protocol, source, tuple(log.events), log.state)

@@ -10,7 +10,7 @@ from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing as GateStanding
 from service.core.gates.verdict import figure, standing
 from service.core.protocol.models import Protocol, Step
-from service.core.records.events import GateVerdict, RunStarted
+from service.core.records.events import GateVerdict
 from service.core.records.import_list import imported_sentence
 from service.core.recovery import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator, Decision, decide
@@ -265,8 +265,7 @@ class RunFrame:
 def run_frame(site: Site, run_id: str) -> RunFrame:
     """Return the frame of a run's pages. Raises UnknownRunError."""
     log = site.run(run_id)
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the run was read
+    root = log.root
     here = f"/runs/{run_id}"
     now_utc_s = site.store.clock.utc_s()
     holder = Control(site.store).holder(run_id)

@@ -16,7 +16,6 @@ from service.core.records.events import (
     Event,
     FurtherExposure,
     RecordedView,
-    RunStarted,
     ViewpointCaptured,
     ViewpointFailed,
 )
@@ -287,9 +286,7 @@ def _plain(reason: str) -> str:
 
 def recorded_rig_section(log: RunRecord) -> RigSection:
     """Return what the rig file of the run says. Raises ConfigurationError if this version cannot read it."""
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the record was read
-    return _section(log.store.artefact_path(root.rig.sha256))
+    return _section(log.store.artefact_path(log.root.rig.sha256))
 
 
 def rig_cameras(log: RunRecord) -> tuple[str, ...]:
