@@ -9,8 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import BaseModel, ConfigDict
-
 from service.core.protocol.models import Step
 from service.core.records.events import (
     Event,
@@ -29,30 +27,6 @@ from service.steps.notes import board_plans
 
 if TYPE_CHECKING:
     from service.dataset.further_cameras import KnownFurtherCamera
-
-
-class StatedCamera(BaseModel):
-    """Camera, lens and settings as a photograph states them; None where it does not."""
-
-    model_config = ConfigDict(frozen=True)
-
-    model: str | None = None
-    body_serial: str | None = None
-    lens: str | None = None
-    lens_serial: str | None = None
-    focal_length_mm: float | None = None
-    aperture_f: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-    focus_mode: str | None = None
-    focus_distance_m: float | None = None
-    width: int | None = None
-    height: int | None = None
-
-
-def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
-    """Return what the photograph of a view states about the camera."""
-    return StatedCamera.model_validate(view.camera)
 
 
 def step_to_show(log: RunRecord, steps: Sequence[Step], wanted: str) -> Step | None:

@@ -249,7 +249,7 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
         with store.database.reading() as connection:
             values = findings.corrected_values(connection, run)
             original = rows.one_event(connection, run, 2)
-        assert [(v.old, v.new, v.original, v.latest) for v in values] == [
+        assert [(v.correction.old, v.correction.new, v.original, v.latest) for v in values] == [
             ("here", "table 2", "here", False),
             (1, 7, 1, True),
             ("here", "table 3", "here", True),
