@@ -61,14 +61,15 @@ def runs_command(
     for heading in ("run", "started (UTC)", "specimen", "purpose", "protocol", "by", "result"):
         table.add_column(heading)
     for run in found:
-        cells = (run.about.specimen, run.about.purpose, f"{run.protocol} {run.version}", by(run), result_words(run))
-        table.add_row(run.run_id, run.created_utc[:16].replace("T", " "), *cells)
+        basics, about = run.basics, run.basics.about
+        cells = (about.specimen, about.purpose, f"{basics.protocol} {basics.version}", by(run), result_words(run))
+        table.add_row(basics.run_id, basics.created_utc[:16].replace("T", " "), *cells)
     print_table(table)
 
 
 def by(run: FoundRun) -> str:
     """Return who worked at the rig or, if that was not given, who started the run."""
-    return run.about.operator or run.begun_by
+    return run.basics.about.operator or run.basics.operator
 
 
 def result_words(run: FoundRun) -> str:
@@ -76,18 +77,20 @@ def result_words(run: FoundRun) -> str:
     words = [RESULT_WORDS[run.status]]
     if run.accuracy is not None:
         words.append(run.accuracy.words)
-    return ", ".join([*words, *(["released"] if run.released else [])]) + (" · simulated" if run.simulated else "")
+    words += ["released"] if run.released else []
+    return ", ".join(words) + (" · simulated" if run.basics.simulated else "")
 
 
 def _record(run: FoundRun) -> dict[str, object]:
+    basics = run.basics
     return {
-        "run": run.run_id,
-        "created_utc": run.created_utc,
-        "simulated": run.simulated,
-        "protocol": run.protocol,
-        "version": run.version,
-        "begun_by": run.begun_by,
-        "about": run.about.model_dump(),
+        "run": basics.run_id,
+        "created_utc": basics.created_utc,
+        "simulated": basics.simulated,
+        "protocol": basics.protocol,
+        "version": basics.version,
+        "begun_by": basics.operator,
+        "about": basics.about.model_dump(),
         "notes": list(run.notes),
         "status": run.status,
         "released": run.released,

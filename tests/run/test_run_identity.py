@@ -290,7 +290,7 @@ def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     web.store.record(spine, [RunAborted(reason="enough")], actor="runner")
     knee = start(browser, specimen="Knee 3", purpose="Teaching", text="")
     done = web.record_run()
-    find = lambda **wanted: [run.run_id for run in find_runs(web.store, RunSearch(**wanted))]  # noqa: E731
+    find = lambda **wanted: [run.basics.run_id for run in find_runs(web.store, RunSearch(**wanted))]  # noqa: E731
     assert find() == [done, knee, spine]
     assert find(q="spine 7") == [spine]
     assert find(q="KNEE teaching") == [knee]

@@ -239,7 +239,7 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
     """Show the runs, newest first."""
     with audit.site.store.database.reading() as connection:
         every = rows.runs(connection)
-    said = {run.run_id for run in find_runs(audit.site.store, RunSearch(q=query.q))}
+    said = {run.basics.run_id for run in find_runs(audit.site.store, RunSearch(q=query.q))}
     listed = [_listed(audit, basics) for basics in every]
     found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, query)]
     pages = max(1, -(-len(found) // _RUNS_A_PAGE))

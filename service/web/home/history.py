@@ -34,7 +34,7 @@ def history_page(
     request: Request, site: CurrentSite, rigs: Annotated[str, Query(pattern="^(|real|simulated)$")] = ""
 ) -> HTMLResponse:
     """Show every instrument that took part in a run with figures; of all rigs, the real or the simulated ones."""
-    rows = [row for row in history(site.store) if not rigs or row.run.simulated == (rigs == "simulated")]
+    rows = [row for row in history(site.store) if not rigs or row.run.basics.simulated == (rigs == "simulated")]
     courses = [_course(instrument, mine) for instrument, mine in by_instrument(rows).items()]
     return render(request, "home/history.html.j2", courses=courses, rigs=rigs, count=len(rows))
 
@@ -58,7 +58,7 @@ def _course(instrument: Instrument, rows: Sequence[HistoryRow]) -> InstrumentHis
 
 def _chart(figure: Figure, rows: Sequence[HistoryRow]) -> TimeChart | None:
     points = [
-        TimePoint(row.at_utc, row.values[figure.key], f"run {row.run.run_id}", row.run.simulated)
+        TimePoint(row.at_utc, row.values[figure.key], f"run {row.run.basics.run_id}", row.run.basics.simulated)
         for row in rows
         if figure.key in row.values
     ]

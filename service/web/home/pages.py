@@ -83,7 +83,7 @@ def home(
 
     Only the runs of the page shown are read whole.
     """
-    found = {run.run_id: run for run in find_runs(site.store, wanted)}
+    found = {run.basics.run_id: run for run in find_runs(site.store, wanted)}
     rows = _in_order(site, found)
     pages = max(1, -(-len(rows) // _PAGE))
     page = min(wanted.page, pages)
@@ -208,7 +208,7 @@ def start_form(
             where=str(site.protocols),
             remedy="Choose one of the first page",
         )
-    earlier = [run.about for run in find_runs(site.store, RunSearch())]
+    earlier = [run.basics.about for run in find_runs(site.store, RunSearch())]
     return render(
         request,
         "home/start.html.j2",
@@ -278,7 +278,7 @@ def compare_page(
     chosen = list(dict.fromkeys(run or []))
     comparison = compare_runs(*(ComparedRun.of(site.run(run_id)) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]
-    missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
+    missing = [run_id for run_id in chosen if run_id not in {each.basics.run_id for each in offered}]
     return render(
         request,
         "home/compare.html.j2",

@@ -22,7 +22,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """What every chart has: its title, its height, and the marks on its axes."""
+    """A chart: its title, its height, and the marks on its axes."""
 
     title: str
     height: float
@@ -288,7 +288,7 @@ def time_chart(
         return round(_TIME_TOP + (_HEIGHT - _TIME_TOP - _TIME_BOTTOM) * (high - value) / (high - low), 1)
 
     marks = tuple(
-        TimeMark(x(at_s), y(p.value), p.simulated, _mark_words(p, unit))
+        TimeMark(x(at_s), y(p.value), p.simulated, _mark_label(p, unit))
         for at_s, p in zip(times, points, strict=True)
     )
     newest = points[-1].value
@@ -303,14 +303,14 @@ def time_chart(
         height=_HEIGHT,
         marks=marks,
         lines=_lines(marks),
-        x_ticks=tuple(Tick(x(at_s), words) for at_s, words in _days(first, last)),
+        x_ticks=tuple(Tick(x(at_s), label) for at_s, label in _days(first, last)),
         y_ticks=tuple(Tick(y(k * spacing), f"{k * spacing:.{digits}f}") for k in count),
         limit=y(limit) if drawn and limit is not None else None,
         limit_text="" if limit is None else f"limit of the newest run {limit:g}",
     )
 
 
-def _mark_words(point: TimePoint, unit: str) -> str:
+def _mark_label(point: TimePoint, unit: str) -> str:
     at = point.at_utc[:16].replace("T", " ")
     return f"{point.value:.5g} {unit}, {at} UTC, {point.of}" + (", simulated" if point.simulated else "")
 
@@ -348,5 +348,5 @@ def _days(first: float, last: float) -> list[tuple[float, str]]:
     )
     step = next((s for s in steps if (last - first) / s <= 4), 365 * _DAY_S)
     at = [k * step for k in range(math.ceil(first / step), math.floor(last / step) + 1)]
-    form = "%m-%d %H:%M" if step < _DAY_S else "%Y-%m-%d"
-    return [(s, datetime.fromtimestamp(s, UTC).strftime(form)) for s in at[:5]]
+    pattern = "%m-%d %H:%M" if step < _DAY_S else "%Y-%m-%d"
+    return [(s, datetime.fromtimestamp(s, UTC).strftime(pattern)) for s in at[:5]]
