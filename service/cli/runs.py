@@ -29,7 +29,7 @@ from service.cli.common import (
 )
 from service.core.gates.measure_names import measure_name
 from service.core.text.words import counted
-from service.run_record import read_log
+from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
 

@@ -19,7 +19,7 @@ from service.dataset.records import DataSet
 from service.dataset.registrations import own_registration, registrations, signed_rows
 from service.dataset.run_data_set import data_set_of
 from service.dataset.view_covariances import pose_covariance
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.outlines import displayed_registration, scan_spheres

@@ -18,7 +18,7 @@ from service.core.run.fold import fold, initial_state
 from service.core.run.state import LATER, REDUCED, WAITED, JobState, Note, RunState
 from service.dataset.registrations import better_later, evaluated, own_registration, registrations
 from service.dataset.summary import RunSummary
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.steps.due_jobs import due, missing_results

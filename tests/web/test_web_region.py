@@ -18,8 +18,8 @@ from service.core.records.events import RegionDrawn
 from service.core.run.fold import fold
 from service.core.run.state import JobState
 from service.dataset.scene_view import scene_json, viewing_frame
+from service.followed_run import RunRecord, read_log
 from service.jobs import fuse
-from service.run_record import RunRecord, read_log
 from service.run_start import recorded_run
 from service.web.scene.data import scene_of
 from tests.support.pages.web import Browser, WebSite, web_site

@@ -17,11 +17,11 @@ from service.core.run.folded import FoldedRun
 from service.core.run.state import StepState
 from service.core.units import mm
 from service.dataset.registrations import evaluated
+from service.followed_run import RunRecord
 from service.jobs import calibrate
 from service.jobs.evaluate import Row
 from service.jobs.records import Camera
 from service.people.approvals import difference
-from service.run_record import RunRecord
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name
 _STANDINGS = {

@@ -13,7 +13,7 @@ from service.core.gates.acceptance import AcceptedGate, depends_on
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.records.events import Event, ViewpointCaptured
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.web.calibration.view import (
     Calibration,
     Certificate,

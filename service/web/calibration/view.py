@@ -12,10 +12,10 @@ from service.core.protocol.models import Step
 from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_optics, recorded_report
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
 from service.core.run.state import StepState
+from service.followed_run import RunRecord
 from service.jobs import calibrate
 from service.jobs.calibration_records import ArmAnswer, HandEye, Intrinsics, Residuals
 from service.jobs.records import Camera
-from service.run_record import RunRecord
 from service.steps.kinds.calibration import Params
 from service.web.page.charts import DotPlot, HeatMap, VectorField, dots, heat_map, vector_field
 from service.web.record.images import BoardUse, board_use, captures_of

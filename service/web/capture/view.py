@@ -17,8 +17,8 @@ from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
+from service.followed_run import RunRecord
 from service.jobs import further_view, live_summary, live_view
-from service.run_record import RunRecord
 from service.steps.notes import suggested_views
 from service.web.record.images import (
     BoardUse,

@@ -18,9 +18,9 @@ from service.core.run.expected import tries_words
 from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState, lost_arms
 from service.core.text.words import time_here
+from service.followed_run import RunRecord
 from service.monitor.snapshot import STOPS, RobotPhase, Standing, read_snapshot
 from service.people.control import Control
-from service.run_record import RunRecord
 from service.steps import step_kinds
 from service.steps.coats import Coat, coats
 from service.steps.context import ROBOT_MOVES, Announcement, BeforeStep

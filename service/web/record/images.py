@@ -18,11 +18,11 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.state import JobState, RunState, StepState, Superseded
+from service.followed_run import RunRecord
 from service.jobs import board_view, calibrate, further_view, live_view
 from service.jobs.calibration_records import Intrinsics
 from service.jobs.records import image_of
 from service.rig import RigSection, parse_recorded_rig
-from service.run_record import RunRecord
 from service.steps.notes import board_plans
 
 if TYPE_CHECKING:
