@@ -6,6 +6,8 @@ Where the system tells nothing of this, the answer is that nothing was kept wait
 from __future__ import annotations
 
 import re
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,21 +64,61 @@ def killed_for_memory() -> int:
     return 0 if told is None else int(told[1])
 
 
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What a look at a thread shows: its times, and since when it has been ready without running; None: it sleeps."""
+
+    times: ProcessorTime
+    waits_since_s: float | None
+
+
+def _is_ready(thread: int, process: int | str) -> bool:
+    """Whether a thread runs, or would if it had a processor; False where no system tells it."""
+    try:
+        status = Path(f"/proc/{process}/task/{thread}/stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[:1] == ["R"]
+
+
 @dataclass
 class HeldUp:
-    """Measures, from when it is made, how long a process was kept from running."""
+    """Measures, from when it is made, how long a process was kept from running.
+
+    Linux counts a wait for a processor when it ends. A thread that was ready at two looks, without having run in
+    between, has waited since the first of them: `look` often enough, and a wait that goes on counts as well.
+    """
 
     process: int | str
+    monotonic: Callable[[], float] = time.monotonic
     _began: dict[int, ProcessorTime] = field(init=False)
     _memory_s: float = field(init=False)
+    _seen: dict[int, _Seen] = field(init=False, default_factory=dict[int, "_Seen"])
 
     def __post_init__(self) -> None:
         self._began, self._memory_s = processor_times(self.process), memory_stall_s()
+        self.look()
+
+    def look(self) -> None:
+        """Look at the threads once more."""
+        now_s, before = self.monotonic(), self._seen
+        self._seen = {}
+        for thread, times in processor_times(self.process).items():
+            last, ready = before.get(thread), _is_ready(thread, self.process)
+            waits = ready and last is not None and last.waits_since_s is not None and last.times == times
+            since_s = last.waits_since_s if last is not None and waits else now_s
+            self._seen[thread] = _Seen(times, since_s if ready else None)
 
     @property
     def seconds(self) -> float:
         """The longest that one of its threads has waited for a processor, and the time lost to want of memory."""
-        waits_s = [times.waited_s - self._before(thread).waited_s for thread, times in self._now().items()]
+        self.look()
+        now_s = self.monotonic()
+        waits_s = [
+            seen.times.waited_s - self._before(thread).waited_s
+            + (0.0 if seen.waits_since_s is None else now_s - seen.waits_since_s)
+            for thread, seen in self._seen.items()
+        ]  # fmt: skip
         return max(waits_s, default=0.0) + memory_stall_s() - self._memory_s
 
     @property

@@ -31,10 +31,10 @@ import psutil
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.job_memory import RADIUS_M, SCENE, Folder
 from service.compute.images.develop_parameters import PARAMETERS
-from service.compute.resources import keep_freed_memory
 from service.core.units import megabytes
 from service.jobs import develop, features, match, merge_scans
 from service.jobs.kind import JobKind
+from service.machine.resources import keep_freed_memory
 from service.worker.job import JobContext, RecordedContext, handler_of
 from simulators.rendering.sensor import bordered, camera_picture, read_out
 from simulators.scan_station.station import scan_scene

@@ -33,10 +33,10 @@ import numpy as np
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from service.compute.ground_truth.surface import Surface, read_ply
-from service.compute.resources import keep_freed_memory
 from service.core.records.events import ArtefactRef
 from service.core.units import metres
 from service.jobs import coverage_points, ct_surface, fuse, locate_spheres
+from service.machine.resources import keep_freed_memory
 from service.store.artefacts import hash_file
 from service.worker.job import JobAnswer, JobContext, RecordedContext, handler_of
 from simulators.ct_suite.volume import grid_around, voxelise

@@ -8,13 +8,16 @@ from typing import Any
 
 import typer
 
+from service.cli.exit_status import MEANINGS
 from service.cli.main import app
 
 _HEAD = """\
 Made from the code by `make reference`.
 
-Status 0 means done, 1 refused, failed or not completed, 2 wrong usage. Errors say what is wrong, where, and what to
-do; with `--json` the answer is one JSON object on the last line of the standard output.
+Errors say what is wrong, where, and what to do; with `--json` the answer is one JSON object on the last line of the
+standard output.
+
+## Exit statuses
 """
 
 
@@ -22,7 +25,8 @@ def commands_text() -> str:
     """A Markdown page."""
     group: Any = typer.main.get_command(app)
     context = group.make_context("orthocapture", [], resilient_parsing=True)
-    lines = ["# The command line", "", _HEAD]
+    lines = ["# The command line", "", _HEAD, "| status | meaning |", "|---:|---|"]
+    lines += [*(f"| {status.value} | {meaning} |" for status, meaning in MEANINGS.items()), ""]
     for name in group.list_commands(context):
         _, command, _ = group.resolve_command(typer.Context(group), [name])
         lines += _command(f"orthocapture {name}", command)

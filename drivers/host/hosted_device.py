@@ -48,6 +48,7 @@ _READING = frozenset({"report", "settings"})  # calls that only read what the de
 # Of these a process does not die by a fault of its own: the system or a person sends them.
 _FROM_OUTSIDE = frozenset({signal.SIGKILL, signal.SIGALRM, signal.SIGTERM, signal.SIGXCPU})
 _PROMPT_S = 0.1
+_LOOK_S = 0.2  # how often a late call's process is looked at: a wait that goes on counts from the first look
 _WORTH_WAITING_S = 0.02
 _BUSY_SHARE = 0.25  # of a call's time limit; held up for longer, the driver is not to blame
 
@@ -270,12 +271,16 @@ class HostedDevice:
         held_up: HeldUp | None = None  # measured only where an answer is late: there are hundreds in a second
         deadline_s = began_s + min(timeout_s / 2, _PROMPT_S)
         while True:
-            if child.line.poll(max(0.0, deadline_s - time.monotonic())):
+            left_s = deadline_s - time.monotonic()
+            if child.line.poll(max(0.0, left_s if held_up is None else min(left_s, _LOOK_S))):
                 sequence, ok, value = cast("tuple[int, bool, Any]", child.line.receive())
                 if sequence == self._sequence:  # older answers belong to calls that Ctrl-C interrupted
                     return ok, value
                 continue
             held_up = held_up or HeldUp(child.process.pid)
+            if time.monotonic() < deadline_s:
+                held_up.look()
+                continue
             longest_s = min(timeout_s + held_up.seconds, MOST_STRETCHED * timeout_s)
             if began_s + longest_s <= deadline_s + _WORTH_WAITING_S:
                 raise _NoAnswerError(held_up.seconds)

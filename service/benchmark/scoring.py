@@ -14,12 +14,12 @@ from service.compute.ground_truth.fuse import compact
 from service.compute.ground_truth.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.overlap import Box
 from service.compute.ground_truth.surface import Surface, write_ply
-from service.compute.resources import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm
 from service.dataset.formats.meshes import png
 from service.dataset.records import DataSet, Mesh
+from service.machine.resources import large_arrays_returned
 
 MARGIN_M = 0.002
 _POINTS = 200_000  # of the truth, by which its box is found

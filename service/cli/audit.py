@@ -31,6 +31,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.cli.terminal_output import listed, styled
 from service.core.errors import IntegrityError
@@ -193,7 +194,7 @@ def verify_command(
     else:
         _print_report(report)
     if not report.ok:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:

@@ -24,6 +24,7 @@ from service.cli.common import (
     require_writable,
     require_writable_folder,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.core.text.words import counted
@@ -96,7 +97,7 @@ def report_command(
     if not verified.ok:
         if not json:
             error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
@@ -155,7 +156,7 @@ def figures_command(
             verified = audit.verify(data, run_id, progress)
             if not verified.ok:
                 error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
-                raise typer.Exit(1)
+                raise typer.Exit(ExitStatus.FAILED)
             # The numerics take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
             from service.audit.report.content import report_content  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""Shared by all commands: consoles, options, exit statuses for errors, a progress bar, and the shipped protocols."""
+"""Shared by all commands: consoles, options, errors as they are shown, a progress bar, and the shipped protocols."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ from rich.measure import Measurement
 from rich.table import Table
 from typer.models import OptionInfo
 
+from service.cli.exit_status import ExitStatus, exit_status
 from service.cli.terminal_output import Terminal, bar_of_shares
-from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError, ProtocolError
+from service.core.errors import ConfigurationError, OrthocaptureError, ProtocolError
 from service.core.shown_text import shown, shown_json, shown_lines
 
-# The run waits for a decision of a person, and this command had nobody to ask: EX_TEMPFAIL of sysexits.h.
-WAITS_FOR_A_PERSON = 75
 PROGRESS_AFTER_S = 2.0
 _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 
@@ -91,11 +90,6 @@ def print_document(text: str) -> None:
     sys.stdout.flush()
 
 
-def exit_status(error: OrthocaptureError) -> int:
-    """Return the exit status of a command that ends with this error."""
-    return WAITS_FOR_A_PERSON if isinstance(error, PersonNeededError) else 1
-
-
 def error_record(error: OrthocaptureError) -> dict[str, str]:
     """Return an error as plain data, for JSON output."""
     return {"kind": type(error).__name__, "what": error.what, "where": error.where, "remedy": error.remedy}
@@ -105,7 +99,9 @@ def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
     """Print an error and return the exit to raise, as in `raise fail(error)`, with `exit_status`."""
     status = exit_status(error)
     if json:
-        print_json({"error": error_record(error), **({"exit_status": status} if status != 1 else {})})
+        print_json(
+            {"error": error_record(error), **({"exit_status": status} if status is not ExitStatus.FAILED else {})}
+        )
     else:
         error_console.tell(("Error:", "bold red"), f" {error.what}")
         if error.where:
@@ -131,7 +127,7 @@ def reporting_errors(json: bool = False) -> Generator[None]:
         if not json:
             raise
         print_json({"error": _bug_record(error)})
-        raise typer.Exit(1) from error
+        raise typer.Exit(ExitStatus.FAILED) from error
 
 
 def _bug_record(error: Exception) -> dict[str, str | list[str]]:

@@ -36,6 +36,7 @@ from service.cli.common import (
     require_writable_folder,
     shipped_protocols,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.run import drive, end_with_children, sigterm_like_ctrl_c
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
@@ -85,7 +86,7 @@ def demo_command(
     else:
         _print(result, rows, truth)
     if not result.audit_ok:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _run_to_its_end(data: Path, rig_file: Path) -> str:

@@ -28,6 +28,7 @@ from service.cli.common import (
     protocol_file,
     reporting_errors,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.run import RigOption
 from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.disk_space import Forecast, Usage, forecast
@@ -116,7 +117,7 @@ def doctor_command(
                 f"second place of the signatures {place['path']}: {place['problem'] or 'up to date'}", markup=False
             )
     if not healthy:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | OrthocaptureError]:

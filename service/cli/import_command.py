@@ -24,6 +24,7 @@ from service.cli.common import (
     reporting_errors,
     shipped_protocols,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.operators import part_of
 from service.cli.options import (
     OperatorOption,
@@ -152,7 +153,7 @@ def import_command(
         else:
             _show_result(run_id, state.status, len(state.deviations), table, note)
         if state.status != "completed":
-            raise typer.Exit(1)
+            raise typer.Exit(ExitStatus.FAILED)
 
 
 def _parts_of(protocol: Protocol) -> set[PhotographRole | FileRole]:

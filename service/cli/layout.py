@@ -11,6 +11,7 @@ from rich.table import Table
 
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
+from service.cli.exit_status import ExitStatus
 from service.cli.spheres import spheres_of
 from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
@@ -45,7 +46,7 @@ def layout_command(
         else:
             _show(report, centres, radius_m)
     if not report.passed:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _centres(

@@ -27,6 +27,7 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.terminal_output import styled
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe
@@ -34,8 +35,12 @@ from service.core.units import megabytes
 from service.jobs import term
 from service.worker.loop import HANDLERS
 
-_COULD_NOT = 2
-_STATUS = {"identical": 0, "within_tolerance": 0, "different": 1, "not_replayed": _COULD_NOT}
+_STATUS = {
+    "identical": ExitStatus.DONE,
+    "within_tolerance": ExitStatus.DONE,
+    "different": ExitStatus.FAILED,
+    "not_replayed": ExitStatus.NOT_POSSIBLE,
+}
 _SHOWN = 8  # most differences shown per job
 _WORDS = {
     "identical": ("equal, bit for bit", "bold green"),
@@ -86,7 +91,7 @@ def replay_command(
             write_whole(out / "replay.json", text + "\n")
     except OrthocaptureError as error:
         fail(error, json=json)  # only prints; its exit status 1 would mean a difference
-        raise typer.Exit(_COULD_NOT) from error
+        raise typer.Exit(ExitStatus.NOT_POSSIBLE) from error
     if json:
         print_json(report_json(report))
     else:

@@ -29,6 +29,7 @@ from service.cli.common import (
     protocol_file,
     reporting_errors,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.operators import (
     AutomaticOperator,
     Display,
@@ -401,4 +402,4 @@ def _report_end(run_id: str, state: RunState, *, json: bool) -> None:
     else:
         console.print(f"Run {run_id} is {state.status}; {state.deviations_told}. Evidence: audit verify")
     if state.status != "completed":
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)

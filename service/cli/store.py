@@ -18,6 +18,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable_folder,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.core.text.words import counted
 from service.core.units import gigabytes
@@ -57,7 +58,7 @@ def backup_command(
     else:
         _print_backup(made)
     if made.state.faults:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def restore_command(
@@ -86,7 +87,7 @@ def restore_command(
     else:
         _print_restore(made)
     if not made.ok:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _backup_json(made: BackupReport) -> dict[str, Any]:
@@ -181,7 +182,7 @@ def rebuild_command(
     else:
         _print(made)
     if made.lost:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _print(made: RebuildReport) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, NoAnswer
 from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Point, PosedPhotograph
+from service.machine.resources import IMAGE_MB, processes_for
 
 DetectorName = Literal["classical", "paper", "grounded", "vote"]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import PosedPhotograph, SpheresFound
 from service.jobs.register import Registration
+from service.machine.resources import IMAGE_MB, processes_for
 
 
 class Arguments(JobRecord):

@@ -6,9 +6,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.compute.resources import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, ImageFile, Matrix, ParameterCovariance, Point
+from service.machine.resources import IMAGE_MB, processes_for
 
 
 class FirstCamera(JobRecord):

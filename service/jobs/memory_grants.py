@@ -20,10 +20,10 @@ from pathlib import Path
 import psutil
 from pydantic import ValidationError
 
-from service.compute.resources import MachineMemory, machine_memory
 from service.core.errors import ComputeError
 from service.core.records.events import Record
 from service.core.units import megabytes
+from service.machine.resources import MachineMemory, machine_memory
 from service.store.durable_effects import Clock
 from service.store.runs import ProcessIdentity
 

@@ -34,7 +34,6 @@ from service.compute.pixels.resample import resample
 from service.compute.registration.common_errors import UNEXPLAINED
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.compute.registration.identity import Assignment
-from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
@@ -45,6 +44,7 @@ from service.dataset.registrations import best_row
 from service.jobs import evaluate as job
 from service.jobs.records import Hash, PosedPhotograph, SpheresFound
 from service.jobs.register import Registration
+from service.machine.resources import IMAGE_MB, processes_for
 from service.worker.inputs import photographs_at
 from service.worker.job import JobAnswer, JobContext
 from service.worker.outlines import read_outlines

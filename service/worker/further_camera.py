@@ -23,13 +23,13 @@ from service.compute.registration.further_camera import (
     sighted_pose,
 )
 from service.compute.registration.pose_errors import of_inverse, of_product
-from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
 from service.core.units import mm, mrad
 from service.jobs import further_camera as job
 from service.jobs.records import matrix
+from service.machine.resources import IMAGE_MB, processes_for
 from service.worker.job import JobAnswer, JobContext
 from service.worker.records import camera_of, camera_record
 

@@ -20,7 +20,6 @@ from service.compute.ground_truth.fuse import fuse as fuse_surfaces
 from service.compute.ground_truth.heat_map import HeatScale, fusion_picture, write_heat_mesh
 from service.compute.ground_truth.overlap import Box, Prism, RegionCorrection, outline, seen_along
 from service.compute.ground_truth.surface import Surface, write_ply
-from service.compute.resources import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import ArtefactRef
@@ -28,6 +27,7 @@ from service.core.units import deg, metres, mm
 from service.dataset.records import SIMULATED
 from service.jobs import fuse as job
 from service.jobs.records import Point, SpheresFound, matrix
+from service.machine.resources import large_arrays_returned
 from service.worker.job import JobAnswer, JobContext
 
 _MM = 1e-3  # metres in the unit of the files

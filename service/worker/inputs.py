@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,10 +14,11 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
 from service.compute.pixels.resample import resample
-from service.compute.resources import IMAGE_MB, processes_for
 from service.core.geometry import Array
 from service.jobs.kind import JobRecord
 from service.jobs.records import ArmCorrection, ImageFile, ImagesCamera, Mounting, PosedPhotograph
+from service.machine.processes import mapping
+from service.machine.resources import IMAGE_MB, processes_for
 from service.worker.job import JobContext
 from service.worker.records import camera_reduced, camera_used, corrected_mounting
 
@@ -44,14 +43,14 @@ def photographs_at(
     folder.mkdir(exist_ok=True)
     copies = [folder / f"{image.viewpoint}.jpg" for image in images]
     reduce = partial(_reduce, full=full, width=camera.width, height=camera.height)
-    with ProcessPoolExecutor(processes_for(len(images), IMAGE_MB), mp_context=get_context("spawn")) as pool:
-        for done, _ in enumerate(pool.map(reduce, originals, copies), 1):
+    with mapping(processes_for(len(images), IMAGE_MB), len(images)) as map_over:
+        for done, _ in enumerate(map_over(reduce, list(zip(originals, copies, strict=True))), 1):
             context.progress(f"images at {camera.width} × {camera.height}", done, len(images))
     return copies
 
 
-def _reduce(original: Path, copy: Path, full: CameraModel, width: int, height: int) -> None:
-    cv2.setNumThreads(1)  # the pool already uses every core
+def _reduce(files: tuple[Path, Path], full: CameraModel, width: int, height: int) -> None:
+    original, copy = files
     _, data = cv2.imencode(".jpg", resample(read_image(original), full, width, height), _JPEG)
     copy.write_bytes(data.tobytes())
 

@@ -10,7 +10,6 @@ import numpy as np
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.planning.coverage import coverage_surface
-from service.compute.resources import large_arrays_returned
 from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations, merge_parts
 from service.compute.surfaces.isosurface import (
     LEAST_CONTRAST_HU,
@@ -30,6 +29,7 @@ from service.jobs import locate_spheres as locate_job
 from service.jobs import merge_scans as merge_job
 from service.jobs.records import LoopClosure as LoopClosureRecord
 from service.jobs.records import SphereChange, SphereDetails, SpheresFound, matrix
+from service.machine.resources import large_arrays_returned
 from service.worker.job import JobAnswer, JobContext
 from service.worker.records import judged_layout, measured_sphere
 from service.worker.scene import limits_of

@@ -20,13 +20,13 @@ from service.compute.markers.image_files import LocatedOutlines, detect_all, loc
 from service.compute.markers.paper import detect_file_by_masks
 from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
 from service.compute.markers.refine import remeasure_file
-from service.compute.resources import IMAGE_MB, processes_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.jobs import detect_spheres as job
 from service.jobs import develop as develop_job
 from service.jobs.records import Hash, PosedPhotograph, has_poses
 from service.jobs.structure_from_motion import ModelFile
+from service.machine.resources import IMAGE_MB, processes_for
 from service.worker.inputs import photographs, robot_camera_poses
 from service.worker.job import JobAnswer, JobContext
 from service.worker.records import camera_used

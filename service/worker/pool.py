@@ -21,10 +21,10 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
-from service.compute.resources import compute_in_background, keep_freed_memory
 from service.core.run.state import Lane
 from service.logs.file_log import file_log
 from service.logs.terminal import show_own_words_only
+from service.machine.resources import compute_in_background, keep_freed_memory
 from service.monitor.snapshot import SignOfLife
 from service.store.store import Store
 from service.worker.loop import work

@@ -56,7 +56,7 @@ def test_a_program_that_is_not_there_and_one_that_fails_are_told(tmp_path: Path)
 FREED = """
 from pathlib import Path
 import numpy as np
-from service.compute.resources import keep_freed_memory, return_freed_memory
+from service.machine.resources import keep_freed_memory, return_freed_memory
 
 def resident_mb():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6

@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.support.rig.rig import REPOSITORY
 
 _SAYS = (
-    "import os; from service.compute.resources import compute_in_background; "
+    "import os; from service.machine.resources import compute_in_background; "
     "from tests.poses.test_background_priority import of_the_session; "
     "before = of_the_session(); compute_in_background();"
     " print(before, os.nice(0), of_the_session())"

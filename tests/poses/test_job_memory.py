@@ -10,12 +10,12 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.compute.resources import MachineMemory, machine_memory, processes_for
 from service.core.errors import ComputeError, IllegalTransitionError
 from service.core.records.events import JobFailed
 from service.jobs import job_kinds
 from service.jobs.kind import Demand
 from service.jobs.memory_grants import Grant, MemoryGrants, waiting_for_memory
+from service.machine.resources import MachineMemory, machine_memory, processes_for
 from service.store.records import LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity
 from service.store.store import Store

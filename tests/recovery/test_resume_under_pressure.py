@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
-from service.cli.common import WAITS_FOR_A_PERSON
+from service.cli.exit_status import ExitStatus
 from service.cli.run import end_with_children
 from service.core.records.events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
 from tests.recovery.test_resume import captured, recorded, short_protocol, wait_for, wait_for_captures
@@ -63,6 +63,7 @@ def drivers_of(runner: subprocess.Popen[bytes]) -> list[psutil.Process]:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 def test_a_killed_driver_ends_no_run_and_it_is_resumed_on_a_pressed_machine(tmp_path: Path) -> None:
     """Other signals are told in the same way: tests/robot/test_host.py."""
     data, log = tmp_path / "data", tmp_path / "run.log"
@@ -71,13 +72,13 @@ def test_a_killed_driver_ends_no_run_and_it_is_resumed_on_a_pressed_machine(tmp_
         with begun([*words, "--auto-confirm", "--no-worker", "--json"], log) as runner:
             wait_for_captures(data, 2, runner, log)
             drivers_of(runner)[-1].kill()
-            assert runner.wait(timeout=300) == WAITS_FOR_A_PERSON, log.read_text()
+            assert runner.wait(timeout=300) == ExitStatus.WAITS_FOR_A_PERSON, log.read_text()
         before = captured(data)
         assert 2 <= len(before) < 6
         assert "SIGKILL" in recorded(data, StepFailed)[-1].message
         assert any("SIGKILL" in trouble.message for trouble in recorded(data, DeviceTrouble))
         asked = json.loads(next(line for line in log.read_text().splitlines() if line.startswith('{"error"')))
-        assert asked["exit_status"] == WAITS_FOR_A_PERSON
+        assert asked["exit_status"] == ExitStatus.WAITS_FOR_A_PERSON
         assert "SIGKILL" in asked["error"]["what"]
         must_be_resumed(data, before, log)
 

@@ -11,6 +11,7 @@ import psutil
 import pytest
 from pydantic import BaseModel
 
+from drivers.grbl import GrblConfig
 from drivers.kuka import KukaConfig
 from tests.support.arms.grbl_simulator import TURN, grbl_config, table
 from tests.support.arms.kuka_simulator import simulated_kuka
@@ -21,7 +22,6 @@ from tests.support.processes.waiting import until
 from tests.support.rig.world_watch import WorldWatch, watched_world
 
 pytestmark = [pytest.mark.realtime]
-AT_REST_WITHIN_S = 0.5
 LATE_TIMES = 5  # program, driver, its threads and the controller wake one after the other
 FULL_SPEED_AFTER_S = 0.9  # at 1.5 rad/s² to 1 rad/s
 
@@ -45,6 +45,10 @@ RIGS: dict[str, tuple[Rig, str, tuple[float, float]]] = {
     "kuka": (kuka, "drivers.kuka:DRIVER", (2.5, -2.5)),
     "grbl": (grbl, "drivers.grbl:DRIVER", (-12.0, -0.2)),
 }
+AT_REST_WITHIN_S: dict[str, float] = {
+    "kuka": KukaConfig.model_fields["rest_within_s"].default,
+    "grbl": GrblConfig.model_fields["rest_within_s"].default,
+}
 
 
 @contextlib.contextmanager
@@ -56,20 +60,18 @@ def moving(name: str, folder: Path) -> Generator[tuple[Program, WorldWatch]]:
         try:
             assert program.next("error")["error"] == "LeaveNeededError"
             assert watch.moved_for_s(watch.mark()) == 0.0, "it does not move for nobody"
-            program.let_move("Ada")
             begun_s = watch.mark()
-            program.next("moves_to")
-            watch.wait_moving(begun_s, FULL_SPEED_AFTER_S)
+            program.go_on("Ada", lambda: watch.moved_for_s(begun_s) >= FULL_SPEED_AFTER_S)
             yield program, watch
         finally:
             program.close()
 
 
-def comes_to_rest(watch: WorldWatch, since_s: float, lateness: Lateness) -> None:
+def comes_to_rest(name: str, watch: WorldWatch, since_s: float, lateness: Lateness) -> None:
     """Wait for the device, which must stop in time."""
     watch.wait_resting(since_s)
     went_on_s = watch.moved_for_s(since_s)
-    limit_s = AT_REST_WITHIN_S + LATE_TIMES * lateness.worst_s
+    limit_s = AT_REST_WITHIN_S[name] + LATE_TIMES * lateness.worst_s
     assert went_on_s <= limit_s, f"{went_on_s:.3f} s instead of {limit_s:.3f} s"
 
 
@@ -80,11 +82,11 @@ def test_killed(name: str, victim: str, tmp_path: Path) -> None:
     with moving(name, tmp_path) as (program, watch), Lateness() as lateness:
         since_s = watch.mark()
         program.send((victim, signal.SIGKILL))
-        comes_to_rest(watch, since_s, lateness)
+        comes_to_rest(name, watch, since_s, lateness)
         rested_s = watch.mark()
         if victim == "driver":  # the program reopens it and tries to continue, again and again
-            assert program.next("error")["error"] == "DriverKilledError"
-            assert program.next("error")["error"] == "LeaveNeededError"
+            program.fails_with("DriverKilledError")
+            program.fails_with("LeaveNeededError")
             stays(watch, rested_s)
             goes_on_for_a_person(program, watch)
         else:
@@ -98,11 +100,10 @@ def test_stopped_and_continued(name: str, victim: str, tmp_path: Path) -> None:
     with moving(name, tmp_path) as (program, watch), Lateness() as lateness:
         since_s = watch.mark()
         program.send((victim, signal.SIGSTOP))
-        comes_to_rest(watch, since_s, lateness)
+        comes_to_rest(name, watch, since_s, lateness)
         again_s = watch.mark()
         program.send((victim, signal.SIGCONT))
-        while program.next("error")["error"] != "LeaveNeededError":
-            pass  # at first its stream is old
+        program.fails_with("LeaveNeededError")  # at first its stream is old
         stays(watch, again_s)
         goes_on_for_a_person(program, watch)
 
@@ -115,6 +116,4 @@ def stays(watch: WorldWatch, since_s: float) -> None:
 
 def goes_on_for_a_person(program: Program, watch: WorldWatch) -> None:
     since_s = watch.mark()
-    program.let_move("Grace")
-    program.next("moves_to")
-    watch.wait_moving(since_s, 0.5)
+    program.go_on("Grace", lambda: watch.moved_for_s(since_s) >= 0.5)

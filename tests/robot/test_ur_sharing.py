@@ -11,7 +11,8 @@ from drivers.errors import DeviceRefusedError, DeviceUnavailableError, LeaveNeed
 from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import RobotArm
 from tests.support.arms.arm_watch import watched_arm
-from tests.support.arms.ur_driver import SPEED_UP, let_move, move, opened, travel, turned
+from tests.support.arms.confirming import confirmed
+from tests.support.arms.ur_driver import SPEED_UP, move, opened, travel, turned
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
@@ -80,7 +81,7 @@ def pid_of(arm: RobotArm) -> int:
     return device.pid
 
 
-IMPATIENT = {"watchdog_s": 1.0, "stale_after_s": 1.0, "unattended_s": 5.0, "rest_within_s": 1.5}
+IMPATIENT = {"watchdog_s": 1.0, "stale_after_s": 3.0, "unattended_s": 5.0, "rest_within_s": 1.5}
 
 
 @pytest.mark.slow
@@ -91,9 +92,9 @@ def test_a_driver_that_was_cut_off_says_so_and_moves_again_only_for_a_person(mov
     host = address(95 + moving)
     rig = simulated_ur(host, "--cut-off", "0.5", patience_s=1.0)
     with rig, opened(host, **IMPATIENT) as arm, watched_arm(host) as watch:
-        travel(arm, turned(arm, 0.05))
+        confirmed(arm, lambda: travel(arm, turned(arm, 0.05)))
         if moving:
-            move(arm, turned(arm, 2.5))
+            confirmed(arm, lambda: move(arm, turned(arm, 2.5)))
             watch.wait_moving(0.3)
         os.kill(pid_of(arm), signal.SIGSTOP)
         watch.wait_resting()
@@ -108,5 +109,4 @@ def test_a_driver_that_was_cut_off_says_so_and_moves_again_only_for_a_person(mov
             move(arm, turned(arm, 0.1))
         watch.pass_s(1.0)
         assert watch.moved_for_s(since) == 0.0
-        let_move(arm)
-        travel(arm, turned(arm, 0.1))
+        confirmed(arm, lambda: travel(arm, turned(arm, 0.1)))

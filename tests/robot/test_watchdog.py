@@ -24,17 +24,16 @@ GOAL_RAD = 2.5
 
 
 @contextlib.contextmanager
-def moving(number: int, *, hangs: bool = False, unattended_s: float = 5.0) -> Generator[tuple[Program, ArmWatch]]:
+def moving(number: int, *, unattended_s: float = 5.0) -> Generator[tuple[Program, ArmWatch]]:
     """An arm at full speed, and the program that drives it."""
     host = address(number)
     with simulated_ur(host, patience_s=0), watched_arm(host) as arm:
         config = UrConfig(host=host, unattended_s=unattended_s)
-        program = Program("drivers.ur:DRIVER", config, (GOAL_RAD, -GOAL_RAD), hangs=hangs)
+        program = Program("drivers.ur:DRIVER", config, (GOAL_RAD, -GOAL_RAD))
         try:
             assert program.next("error")["error"] == "LeaveNeededError"
             assert arm.moved_for_s(1) == 0.0, "it does not move for nobody"
-            program.let_move("Ada")
-            arm.wait_moving(0.95)
+            program.go_on("Ada", lambda: arm.now.speed_rad_s >= 0.95)
             yield program, arm
         finally:
             program.close()
@@ -67,8 +66,8 @@ def test_killed(victims: tuple[str, ...]) -> None:
         comes_to_rest(arm, since, lateness)
         rested = arm.mark()
         if victims == ("driver",):  # the program reopens it and tries to continue, again and again
-            assert program.next("error")["error"] == "DriverKilledError"
-            assert "since it was connected" in program.next("error")["message"]
+            program.fails_with("DriverKilledError")
+            assert "since it was connected" in program.fails_with("LeaveNeededError")["message"]
             arm.pass_s(STAYS_S)
             assert arm.moved_for_s(rested) == 0.0
             goes_on_for_a_person(program, arm)
@@ -78,8 +77,7 @@ def test_killed(victims: tuple[str, ...]) -> None:
 
 
 def goes_on_for_a_person(program: Program, arm: ArmWatch) -> None:
-    program.let_move("Grace")
-    arm.wait_moving(0.5)
+    program.go_on("Grace", lambda: arm.now.speed_rad_s >= 0.5)
 
 
 @pytest.mark.parametrize("victim", ["program", "driver"])
@@ -90,17 +88,17 @@ def test_stopped_and_continued(victim: str) -> None:
         comes_to_rest(arm, since, lateness)
         again = arm.mark()
         program.send((victim, signal.SIGCONT))
-        error = program.next("error")
-        assert error["error"] == "LeaveNeededError"
-        assert "gave no sign of life" in error["message"]
+        assert "gave no sign of life" in program.fails_with("LeaveNeededError")["message"]
         arm.pass_s(STAYS_S)  # in which the program tries again and again
         assert arm.moved_for_s(again) == 0.0, "it moves on by itself"
         goes_on_for_a_person(program, arm)
 
 
 def test_a_program_that_lives_but_no_longer_looks_at_its_moving_arm() -> None:
-    with moving(72, hangs=True, unattended_s=0.8) as (_, arm), Lateness() as lateness:
-        comes_to_rest(arm, arm.mark(), lateness, 0.8 + AT_REST_WITHIN_S)
+    with moving(72, unattended_s=0.8) as (program, arm), Lateness() as lateness:
+        since = arm.mark()
+        program.hang()
+        comes_to_rest(arm, since, lateness, 0.8 + AT_REST_WITHIN_S)
         assert arm.now.joints_rad[0] < GOAL_RAD - 0.5, "it was stopped on its way"
 
 
@@ -116,7 +114,6 @@ def test_a_short_lapse_at_rest_needs_nobody() -> None:
             program.send(("driver", signal.SIGSTOP))
             arm.wait_stopped(since)
             program.send(("driver", signal.SIGCONT))
-            program.let_move("Ada")
-            arm.wait_moving(0.5)
+            program.go_on("Ada", lambda: arm.now.speed_rad_s >= 0.5)
         finally:
             program.close()

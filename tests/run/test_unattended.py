@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from service.cli.common import WAITS_FOR_A_PERSON
+from service.cli.exit_status import ExitStatus
 from service.cli.main import app
 from service.cli.operators import AutomaticOperator, Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
@@ -56,7 +56,7 @@ def begin(folder: Path, step: str, *options: str) -> Result:
 @pytest.mark.parametrize("step", STEPS)
 def test_a_question_that_only_a_person_can_answer_has_a_status_of_its_own(tmp_path: Path, step: str) -> None:
     ended = begin(tmp_path, step)
-    assert ended.exit_code == WAITS_FOR_A_PERSON == 75
+    assert ended.exit_code == ExitStatus.WAITS_FOR_A_PERSON == 75
     assert WORDS[step] in ended.stderr
     assert "Resume the run without --auto-confirm and decide" in ended.stderr
     with Store.open(tmp_path / "data") as store:

@@ -70,7 +70,7 @@ def report_scene(summary: RunSummary, *, turning: bool) -> SceneBlock | None:
 
 @dataclass(slots=True)
 class _Geometry:
-    """What is drawn, in millimetres of the viewing frame.
+    """The drawn scene, in millimetres of the viewing frame.
 
     Attributes:
         points: (V, 3) corners of the triangles.

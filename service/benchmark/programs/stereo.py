@@ -12,9 +12,9 @@ import cv2
 
 from service.benchmark.programs.colmap import views_of
 from service.compute.ground_truth.surface import write_ply
-from service.compute.resources import keep_freed_memory
 from service.compute.stereo.reconstruct import reconstruct
 from service.core.errors import OrthocaptureError
+from service.machine.resources import keep_freed_memory
 
 _USAGE = "usage: python -m service.benchmark.programs.stereo DATA MESH"
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -21,7 +19,7 @@ from service.compute.images.photographs import read_grey
 from service.compute.intrinsics.adjustment import fit_pose, pose_matrix, start_pose
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse
-from service.logs.terminal import show_own_words_only
+from service.machine.processes import mapping
 
 _MANY_FILES = 24
 _MANY_BYTES = 30e6
@@ -76,15 +74,8 @@ def find_boards(
         board.charuco()
     work = partial(_find, board=board)
     found: list[BoardImage] = []
-    if workers <= 1 or not _worth_processes(files):
-        for file in files:
-            found.append(work(file))
-            if progress:
-                progress(len(found), len(files))
-        return tuple(found)
-    pool_of = partial(ProcessPoolExecutor, mp_context=get_context("spawn"), initializer=show_own_words_only)
-    with pool_of(min(workers, len(files))) as pool:
-        for image in pool.map(work, files):
+    with mapping(workers if _worth_processes(files) else 1, len(files)) as map_over:
+        for image in map_over(work, files):
             found.append(image)
             if progress:
                 progress(len(found), len(files))

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,13 +36,12 @@ from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
-from service.logs.terminal import show_own_words_only
+from service.machine.processes import MapFunction, mapping
 
 _MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
 
 Progress = Callable[[int, int], None]
 DetectFile = Callable[[Path, CameraModel, DetectionOptions], tuple[SphereOutline, ...]]
-_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
@@ -116,7 +111,7 @@ def detect_all(
     Raises:
         DataError: an image cannot be used; the message names the first one.
     """
-    with _mapping(workers, len(image_paths)) as map_over:
+    with mapping(workers, len(image_paths)) as map_over:
         work = partial(_detected, detect or detect_file, camera, options)
         return tuple(_counted(map_over(work, image_paths), len(image_paths), progress))
 
@@ -162,7 +157,7 @@ def locate_outlines(
     stations = images.stations
     shown = np.zeros(n, dtype=np.int64) if scenes is None else np.asarray(scenes, dtype=np.int64)
     sets = [np.nonzero((stations == g) & (shown == s))[0] for g in np.unique(stations) for s in np.unique(shown)]
-    with _mapping(workers, n) as map_over:
+    with mapping(workers, n) as map_over:
         look = partial(_look, camera=images.camera, options=options)
         first = _register_anchors(image_paths, images, spheres, [m for m in sets if len(m)], options, map_over)
         if first is None:
@@ -220,7 +215,7 @@ def search_nearby(
     Raises:
         DataError: an image cannot be used; the message names the first one.
     """
-    with _mapping(workers, len(expected)) as map_over:
+    with mapping(workers, len(expected)) as map_over:
         work = partial(_nearby, camera=camera, options=options)
         return tuple(_counted(map_over(work, expected), len(expected), progress))
 
@@ -241,22 +236,6 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageO
     return find_outlines(read_image_of(task.path, camera), camera, task.expected, options)
 
 
-@contextmanager
-def _mapping(workers: int, items: int) -> Generator[MapFunction]:
-    """Provide a map over processes, or the plain one for a single worker."""
-    if workers <= 1 or items <= 1:
-        yield map
-        return
-    context = multiprocessing.get_context("spawn")  # forking a process with threads may deadlock
-    with ProcessPoolExecutor(min(workers, items), mp_context=context, initializer=_one_thread) as pool:
-        yield pool.map
-
-
-def _one_thread() -> None:
-    show_own_words_only()
-    cv2.setNumThreads(1)
-
-
 def _counted(results: Iterable[_Result], total: int, progress: Progress | None) -> Iterator[_Result]:
     for done, result in enumerate(results, 1):
         yield result
@@ -269,14 +248,6 @@ _ANCHORS_WITHOUT_SCALE = (3, 6)
 ANCHOR_WIDTH_PX = 1000  # least width of the reduced image on which an anchor is searched
 _ANCHOR_CANDIDATES = 36  # circles examined in an anchor, those with the most votes
 _SAME_SPHERE = 0.15  # in radii: largest distance of one unlisted sphere seen from two sides
-
-
-class MapFunction(Protocol):
-    """`map`, in this process or over several."""
-
-    def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
-        """Return the results of `work` on the items, in their order."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

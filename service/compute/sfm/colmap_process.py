@@ -5,26 +5,20 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
-import resource
 import tempfile
 import time
 import weakref
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from math import ceil
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, cast
 
-import psutil
-
-from service.compute.resources import keep_freed_memory
 from service.compute.sfm.options import Progress
 from service.core.errors import ComputeError, DataError, OrthocaptureError
 from service.core.geometry import Transform
-from service.logs.terminal import show_own_words_only
+from service.machine.processes import ChildEndedError, ChildLimits, call_in_child
+from service.machine.resources import keep_freed_memory
 
 
 def _child(log: str, seed: int, pipe: Connection) -> None:
@@ -152,11 +146,15 @@ def read_model(folder: Path) -> dict[str, Transform]:
 
 
 def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> object:
-    context = multiprocessing.get_context("spawn")
+    """Call `work` with no more memory and time than an intact model of these files needs.
+
+    Counts in a damaged file may request any amount.
+    """
+    files_bytes = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    limits = ChildLimits(_SPARE_BYTES + _PER_BYTE * files_bytes, _SPARE_S + files_bytes / _BYTES_PER_S)
     try:
-        with ProcessPoolExecutor(1, mp_context=context, initializer=_bound, initargs=(str(folder),)) as pool:
-            outcome = pool.submit(work, *arguments).result()
-    except BrokenProcessPool:
+        outcome = call_in_child(work, *arguments, module="pycolmap", limits=limits)
+    except ChildEndedError:
         outcome = "pycolmap crashed on it, or took far longer than a sound model takes"
     except MemoryError:
         outcome = "it announces more than memory can hold"
@@ -167,25 +165,6 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
             remedy="Check that cameras, images and points3D belong together and are complete",
         )
     return outcome
-
-
-def _bound(folder: str) -> None:
-    """Limit this process's memory and processor time to what an intact model of these files needs.
-
-    Counts in a damaged file may request any amount; beyond the limits, the system ends the process.
-    """
-    show_own_words_only()
-    importlib.import_module("pycolmap")
-    mapped_bytes = psutil.Process().memory_info().vms
-    files_bytes = sum(file.stat().st_size for file in Path(folder).iterdir() if file.is_file())
-    limit = mapped_bytes + _SPARE_BYTES + _PER_BYTE * files_bytes
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
-    limit_s = ceil(time.process_time() + _SPARE_S + files_bytes / _BYTES_PER_S)
-    _, most_s = resource.getrlimit(resource.RLIMIT_CPU)
-    resource.setrlimit(
-        resource.RLIMIT_CPU, (limit_s if most_s == resource.RLIM_INFINITY else min(limit_s, most_s), most_s)
-    )
 
 
 def _read(folder: str) -> dict[str, Transform] | str:

@@ -10,13 +10,13 @@ import numpy as np
 
 from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.render import RayMesh
-from service.compute.resources import return_freed_memory
 from service.compute.stereo.fusion import fused, surface_of
 from service.compute.stereo.matching import DepthMap, depth_of_pair, guided_depth
 from service.compute.stereo.rectify import StereoView, looked_at_m, rectified, stereo_pairs
 from service.compute.stereo.steep import closed, completed
 from service.core.errors import ComputeError
 from service.core.geometry import Array
+from service.machine.resources import return_freed_memory
 
 COARSE_PX, FINE_PX = 960, 1920  # width of the images that are matched at first and then; larger ones are made smaller
 VOXEL_PX = 1.5  # size of a voxel in pixels at the object

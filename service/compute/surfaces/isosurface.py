@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
-from service.compute.resources import forget_pages
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply
+from service.machine.resources import forget_pages
 
 SLAB_VOXELS = 100_000_000  # marching cubes copies its input to float32: 400 MB
 _FACES = 1_000_000  # renumbered at a time

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from service.audit.background import Progress, report
-from service.compute.resources import compute_in_background
+from service.machine.resources import compute_in_background
 
 
 def preview(data: Path, run_id: str, folder: Path, progress: Progress) -> str:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from pydantic import BaseModel
@@ -18,6 +19,7 @@ from pydantic import BaseModel
 from tests.support.processes.forked import Forked
 
 _ENDED: dict[str, Any] = {}  # follows the last line
+_WITHIN_S = 120.0  # which only a hang reaches
 
 
 class Program:
@@ -27,7 +29,6 @@ class Program:
         spec, config: the driver.
         goals_rad: between which its first joint moves.
         motion: its speed (rad/s) and acceleration (rad/s²); the fastest motion of protocols/demo.yaml by default.
-        hangs: its main loop hangs once the arm moves.
     """
 
     def __init__(
@@ -37,10 +38,9 @@ class Program:
         goals_rad: tuple[float, float],
         *,
         motion: tuple[float, float] = (1.0, 1.5),
-        hangs: bool = False,
     ) -> None:
         numbers = map(str, (*goals_rad, *motion))
-        words = (spec, config.model_dump_json(), *numbers, "hangs" if hangs else "lives")
+        words = (spec, config.model_dump_json(), *numbers)
         self._process = Forked(
             [sys.executable, "-m", "tests.support.processes.stubborn_program", *words],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -60,17 +60,40 @@ class Program:
         return self._process.pid
 
     def let_move(self, person: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(person + "\n")
-        self._process.stdin.flush()
-        assert self.next("let_by")["let_by"] == person
+        """Let the arm move for a person; again while it is refused because the stream is old, say."""
+        until_s = time.monotonic() + _WITHIN_S
+        told: dict[str, Any] = {}
+        while told.get("let_by") != person:
+            assert time.monotonic() < until_s, told
+            self._tell(person)
+            told = self.next("let_by")
+
+    def hang(self) -> None:
+        """Let its main loop hang as soon as the arm moves."""
+        self._tell("hang")
+
+    def go_on(self, person: str, moving: Callable[[], bool]) -> None:
+        """Let the arm move until it does, once more when this machine's lapse has taken the leave away."""
+        self.let_move(person)
+        until_s = time.monotonic() + _WITHIN_S
+        while not moving():
+            assert time.monotonic() < until_s, "it does not move"
+            if self._has_lost_leave():
+                self.let_move(person)
+            time.sleep(0.002)
+
+    def fails_with(self, error: str) -> dict[str, Any]:
+        """Return the next failure of this class."""
+        while (line := self.next("error"))["error"] != error:
+            pass
+        return line
 
     def send(self, *signals: tuple[str, signal.Signals]) -> None:
         """Send signals to `program` or `driver`."""
         for to, which in signals:
             os.kill(self.driver if to == "driver" else self.pid, which)
 
-    def next(self, key: str, within_s: float = 120.0) -> dict[str, Any]:
+    def next(self, key: str, within_s: float = _WITHIN_S) -> dict[str, Any]:
         """Return the next line with this key; fail, with the lines that came instead, if none comes in time."""
         deadline_s = time.monotonic() + within_s
         others: list[dict[str, Any]] = []
@@ -97,6 +120,17 @@ class Program:
             with contextlib.suppress(OSError):
                 if pipe is not None:
                     pipe.close()
+
+    def _tell(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
+    def _has_lost_leave(self) -> bool:
+        lost = False
+        while not self._lines.empty():
+            lost |= self._lines.get().get("error") == "LeaveNeededError"
+        return lost
 
     def _read(self) -> None:
         assert self._process.stdout is not None

@@ -1,0 +1,1 @@
+"""What this program takes of its machine: processes, memory, priority. Other machines will be reached from here."""
