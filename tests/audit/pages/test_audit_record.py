@@ -232,9 +232,9 @@ def test_files_of_a_job_are_its_inputs_and_its_results(store: Store, run: str) -
         made = origin(connection, run, result.ref.sha256)
         source = origin(connection, run, image.ref.sha256)
     assert made.job is not None
-    assert image.ref.sha256 in {row.sha256 for row in made.inputs}
-    assert result.ref.sha256 in {row.sha256 for row in source.made_of_it}
-    assert [row.kind for row in source.beside] == ["pose_log"]
+    assert image.ref.sha256 in {row.ref.sha256 for row in made.inputs}
+    assert result.ref.sha256 in {row.ref.sha256 for row in source.made_of_it}
+    assert [row.ref.kind for row in source.beside] == ["pose_log"]
 
 
 # --- corrections and signatures ---------------------------------------------------------------------------------
