@@ -23,7 +23,7 @@ from drivers.errors import (
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCriteria
 from drivers.kuka import KukaConfig
-from service.core.arms.kuka.lbr_med_14 import ARM as LBR_MED_14
+from service.core.arms.model import arm_model
 from service.core.arms.model import flange_pose as forward
 from service.core.arms.seven_axes import nearest_posture, postures
 from service.core.geometry import inverse, rotation_angle_rad, transform
@@ -236,7 +236,7 @@ def test_a_lost_link_is_unavailable_and_opens_again() -> None:
 
 
 def test_seven_axes_reach_every_pose_within_their_limits() -> None:
-    arm, random = LBR_MED_14, np.random.default_rng(7)
+    arm, random = arm_model("LBR Med 14"), np.random.default_rng(7)
     limits = np.array(arm.limits_rad)
     for _ in range(100):
         q = random.uniform(-limits, limits)
@@ -252,7 +252,7 @@ def test_seven_axes_reach_every_pose_within_their_limits() -> None:
 
 
 def test_the_elbow_moves_clear_of_a_limit() -> None:
-    arm = LBR_MED_14
+    arm = arm_model("LBR Med 14")
     free = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 0.9, 0.0])
     at_limit = postures(arm, forward(arm, free))
     room = np.array(arm.limits_rad) - np.abs(at_limit)

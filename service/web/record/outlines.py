@@ -25,7 +25,7 @@ from service.core.units import metres
 from service.dataset.further_cameras import further_pose
 from service.dataset.registrations import best_registration, further_cameras, registrations
 from service.dataset.summary import control_centres, control_scan, registered_scan
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.web.record.images import Capture, further_of
 from service.web.record.pictures import DrawnOutline
 
