@@ -28,7 +28,7 @@ from service.core.arms.model import flange_pose as forward
 from service.core.arms.seven_axes import nearest_posture, postures
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from simulators.kuka_controller.kinematics import MODELS, frames
-from tests.support.arms.confirming import confirmed
+from tests.support.arms.confirming import confirm_and
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
 from tests.support.arms.sunrise import sunrise_engine
 from tests.support.arms.ur_simulator import address
@@ -150,14 +150,14 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) ->
     host = address(73)
     with controller(host, patience_s=0), opened(host, unattended_s=0.3) as arm, Lateness() as lateness:
         start = arm.state().sample.joints_rad[0]
-        confirmed(arm, lambda: move(arm, turned(arm, 2.5)))
+        confirm_and(arm, lambda: move(arm, turned(arm, 2.5)))
         time.sleep(1.5)
         with pytest.raises(LeaveNeededError, match="nobody had looked"):
             wait_for(lambda: not arm.is_moving())
         assert arm.state().sample.joints_rad[0] - start < STOPPED_BY_RAD + LATE_TIMES * lateness.worst_s
         with pytest.raises(LeaveNeededError):
             move(arm, turned(arm, 0.1))
-        confirmed(arm, lambda: travel(arm, turned(arm, 0.1)))
+        confirm_and(arm, lambda: travel(arm, turned(arm, 0.1)))
 
 
 @pytest.mark.realtime
@@ -167,7 +167,7 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
     with controller(host, patience_s=0), opened(host) as arm, Lateness() as lateness:
         driver = driver_pid(arm)
         start = arm.state().sample.joints_rad[0]
-        confirmed(arm, lambda: move(arm, turned(arm, 2.5)))
+        confirm_and(arm, lambda: move(arm, turned(arm, 2.5)))
         os.kill(driver, signal.SIGSTOP)
         try:
             time.sleep(1.5)
@@ -179,7 +179,7 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
         assert arm.state().sample.joints_rad[0] - start < STOPPED_BY_RAD + LATE_TIMES * lateness.worst_s
         with pytest.raises(LeaveNeededError):
             move(arm, turned(arm, 0.1))
-        confirmed(arm, lambda: travel(arm, turned(arm, 0.1)))
+        confirm_and(arm, lambda: travel(arm, turned(arm, 0.1)))
 
 
 def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
