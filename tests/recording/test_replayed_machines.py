@@ -1,0 +1,133 @@
+"""A light box, a GRBL machine and a KUKA arm that `orthocapture doctor --record` heard are served by `--replay`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import serial
+from typer.testing import CliRunner
+
+from drivers.errors import DeviceRefusedError, DeviceTimeoutError
+from drivers.lightbox import LightboxConfig, SerialLightbox
+from drivers.recording import RecordedDevice, Recording, readable
+from service.cli.main import app
+from tests.support.rig.simulator_process import simulator
+
+
+def recorded(file: Path, name: str, section: dict[str, object]) -> RecordedDevice:
+    """Have the doctor write a recording of a rig of one device."""
+    rig = file.with_suffix(".yaml")
+    rig.write_text(json.dumps({"name": "a lab", "devices": {name: section}}))
+    words = ["--rig", str(rig), "--data", str(file.parent / "data"), "--record", str(file), "--json"]
+    result = CliRunner().invoke(app, ["doctor", *words], catch_exceptions=False)
+    assert name in json.loads(result.stdout)["devices"]
+    (device,) = Recording.model_validate_json(file.read_text(encoding="utf-8")).devices.values()
+    return device
+
+
+def changed(file: Path, device: RecordedDevice, answers: dict[str, str]) -> None:
+    """Write a recording in which other answers stand to some questions, or none for an empty one."""
+    said = device.answers
+    exchanges = tuple(
+        one.model_copy(update={"answer": answers.get(one.question, one.answer)})
+        for one in said.exchanges
+        if answers.get(one.question, one.answer)
+    )
+    other = device.model_copy(update={"answers": said.model_copy(update={"exchanges": exchanges})})
+    file.write_text(readable(Recording(by="a test", devices={device.kind: other})), encoding="utf-8")
+
+
+# --- the light box ---
+
+
+def box_section(port: Path) -> dict[str, object]:
+    return {"driver": "lightbox", "port": str(port), "timeout_s": 10.0}
+
+
+@pytest.mark.parametrize("firmware", ["1.2", "1.4"])
+def test_a_light_box_is_the_same_on_the_replay_of_its_recording(tmp_path: Path, firmware: str) -> None:
+    port = tmp_path / "box"
+    with simulator("lightbox", "--link", str(port), "--firmware", firmware):
+        with serial.Serial(str(port), timeout=10.0) as line:
+            line.write(b"SHUTTER 1\n")
+            assert line.readline()
+        first = recorded(tmp_path / "first.json", "box", box_section(port))
+    with simulator("lightbox", "--link", str(port), "--replay", str(tmp_path / "first.json")) as running:
+        again = recorded(tmp_path / "again.json", "box", box_section(port))
+    assert running.ready["not_served"] == ["*IDN?, serial number: (serial number 1)"]
+    assert again.report == first.report
+    assert again.report is not None
+    assert again.report.identity.firmware == firmware
+    assert again.report.details["shutter"] == "1"
+    said, heard = ({one.question: one.answer for one in device.answers.exchanges} for device in (first, again))
+    if firmware == "1.4":  # the pedal's clock goes on from where it was
+        assert heard["PEDAL?"].rpartition(" ")[0] == said["PEDAL?"].rpartition(" ")[0]
+        assert int(heard["PEDAL?"].rpartition(" ")[2]) >= int(said["PEDAL?"].rpartition(" ")[2])
+        del said["PEDAL?"], heard["PEDAL?"]
+    assert heard == said
+
+
+def test_another_makers_light_box_says_what_was_recorded_of_it(tmp_path: Path) -> None:
+    """A reading that it refused is refused again, and one that it never gave is not given."""
+    port, file = tmp_path / "box", tmp_path / "other.json"
+    refusal = "LIGHT?: the light box refuses LIGHT?: 3 sensor fault"
+    device = RecordedDevice.model_validate(
+        {
+            "kind": "lightbox",
+            "driver": "lightbox",
+            "answers": {
+                "exchanges": [
+                    {"question": "*IDN?", "answer": "Lux & Co,LX-9,77,2.0"},
+                    {"question": "SHUTTER?", "answer": "0"},
+                    {"question": "PEDAL?", "answer": "41 60000 90000"},
+                    {"question": "HUMIDITY?", "answer": "40.0"},
+                ],
+                "silent": [refusal, "TEMP?: no usable reply to TEMP? in 3 × 1 s"],
+            },
+        }
+    )
+    changed(file, device, {})
+    with simulator("lightbox", "--link", str(port), "--replay", str(file)) as running:
+        box = SerialLightbox(LightboxConfig(port=str(port), timeout_s=0.2))
+        identity = box.open()
+        pedal = box.pedal()
+        with pytest.raises(DeviceRefusedError, match="3 sensor fault"):
+            box.read()
+        with pytest.raises(DeviceTimeoutError, match="no usable reply to TEMP"):
+            box.report()
+        box.close()
+    assert running.ready["not_served"] == ["HUMIDITY?: 40.0"]
+    assert (identity.model, identity.serial, identity.firmware) == ("Lux & Co LX-9", "77", "2.0")
+    assert (pedal.presses, pedal.pressed_s) == (41, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("answers", "why"),
+    [
+        ({"*IDN?": ""}, "did not tell its identity"),
+        ({"*IDN?": "a,b,c"}, "did not tell its identity"),
+        ({"PEDAL?": "1 2"}, "neither one number nor three"),
+    ],
+)
+def test_a_light_box_of_which_too_little_is_known_is_not_served(
+    tmp_path: Path, answers: dict[str, str], why: str
+) -> None:
+    device = RecordedDevice.model_validate(
+        {
+            "kind": "lightbox",
+            "driver": "lightbox",
+            "answers": {
+                "exchanges": [
+                    {"question": "*IDN?", "answer": "Lux & Co,LX-9,77,2.0"},
+                    {"question": "PEDAL?", "answer": "0"},
+                ]
+            },
+        }
+    )
+    changed(tmp_path / "other.json", device, answers)
+    words = ("lightbox", "--replay", str(tmp_path / "other.json"))
+    with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*words):
+        pass
+    assert why in str(refused.value)
