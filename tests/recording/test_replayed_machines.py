@@ -10,9 +10,11 @@ import serial
 from typer.testing import CliRunner
 
 from drivers.errors import DeviceRefusedError, DeviceTimeoutError
+from drivers.interfaces import answers_of
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.recording import RecordedDevice, Recording, readable
 from service.cli.main import app
+from tests.support.arms.grbl_simulator import LIFT, TURN, grbl_config, opened, table
 from tests.support.rig.simulator_process import simulator
 
 
@@ -131,3 +133,76 @@ def test_a_light_box_of_which_too_little_is_known_is_not_served(
     with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*words):
         pass
     assert why in str(refused.value)
+
+
+# --- GRBL ---
+
+
+def table_section(port: Path) -> dict[str, object]:
+    return {"driver": "grbl", **grbl_config(port, TURN, LIFT).model_dump(mode="json", exclude_defaults=True)}
+
+
+def test_a_grbl_machine_is_the_same_on_the_replay_of_its_recording(tmp_path: Path) -> None:
+    """Also a setting of many digits, one of a fourth axis, and one that the simulator does not know."""
+    settings = ("100=1234.568", "121=150.25", "130=360", "20=0", "1=25", "103=10", "140=7")
+    with table(tmp_path, "--setting", "25=36000", "24=1200", *settings) as port:
+        first = recorded(tmp_path / "first.json", "table", table_section(port))
+    port = tmp_path / "again"
+    with simulator("grbl", "--link", str(port), "--replay", str(tmp_path / "first.json")) as running:
+        again = recorded(tmp_path / "again.json", "table", table_section(port))
+    assert (tmp_path / "again.json").read_text().splitlines()[4:] == (
+        (tmp_path / "first.json").read_text().splitlines()[4:]
+    )
+    assert again == first
+    assert first.report is not None
+    assert any("Soft limits are off" in problem for problem in first.report.problems)
+    answers = [one.answer for one in first.answers.exchanges]
+    assert {"$100=1234.568", "$103=10", "Alarm"} <= set(answers)
+    assert running.ready["not_served"] == [
+        "$I: [VER:1.1h.20190825:(serial number 1)]",
+        "$$: $103: listed, but the simulated machine has 3 axes",
+    ]
+
+
+def test_a_grbl_machine_whose_settings_do_not_suit_is_refused_on_its_replay_as_well(tmp_path: Path) -> None:
+    with table(tmp_path, "--setting", "22=0", "110=720.5") as port:
+        first = recorded(tmp_path / "first.json", "table", table_section(port))
+    assert "homing is off" in first.error
+    assert "$110=720.5" in [one.answer for one in first.answers.exchanges]
+    port = tmp_path / "again"
+    with simulator("grbl", "--link", str(port), "--replay", str(tmp_path / "first.json")):
+        assert recorded(tmp_path / "again.json", "table", table_section(port)) == first
+
+
+def test_a_grbl_machine_with_few_settings_says_what_was_assumed(tmp_path: Path) -> None:
+    """Its own version, name and state are served."""
+    settings = ("$10=1", "$13=0", "$20=1", "$21=1", "$22=1", "$25=36000", "$27=1", "$110=3600", "$120=60", "$130=720")
+    said = [{"question": "$$", "answer": line} for line in (*settings, "$N0=G54")]
+    said += [
+        {"question": "$I", "answer": "[VER:1.1f.20170801:mill]"},
+        {"question": "$I", "answer": "[OPT:VL,35,254]"},
+        {"question": "?", "answer": "Idle"},
+    ]
+    device = RecordedDevice.model_validate({"kind": "robot", "driver": "grbl", "answers": {"exchanges": said}})
+    file, port = tmp_path / "mill.json", tmp_path / "mill"
+    file.write_text(readable(Recording(by="a test", devices={"robot": device})), encoding="utf-8")
+    with simulator("grbl", "--link", str(port), "--replay", str(file)) as running, opened(port, TURN) as axes:
+        report = axes.report()
+        assert answers_of(axes).exchanges[:10] == device.answers.exchanges[:10]
+    assert (report.identity.firmware, report.identity.serial) == ("1.1f.20170801", "mill")
+    assert report.details["state"] == "Idle"
+    assumed = running.ready["not_served"]
+    assert assumed[0] == "$$: $N0=G54"
+    assert assumed[1] == "$$: $100 was not recorded; the machine moves as with 80"
+    assert len(assumed) == 1 + 12 - 3
+
+
+def test_a_grbl_machine_of_which_nothing_is_known_is_not_served(tmp_path: Path) -> None:
+    device = RecordedDevice.model_validate({"kind": "robot", "driver": "grbl", "error": "no answer"})
+    file = tmp_path / "mute.json"
+    file.write_text(readable(Recording(by="a test", devices={"robot": device})), encoding="utf-8")
+    with (
+        pytest.raises(AssertionError, match="did not tell settings and version"),
+        simulator("grbl", "--replay", str(file)),
+    ):
+        pass
