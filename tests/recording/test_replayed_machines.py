@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,11 +11,16 @@ import serial
 from typer.testing import CliRunner
 
 from drivers.errors import DeviceRefusedError, DeviceTimeoutError
-from drivers.interfaces import answers_of
+from drivers.host.hosted_device import hosted
+from drivers.interfaces import RobotArm, answers_of
+from drivers.kuka import KukaConfig
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.recording import RecordedDevice, Recording, readable
 from service.cli.main import app
 from tests.support.arms.grbl_simulator import LIFT, TURN, grbl_config, opened, table
+from tests.support.arms.kuka_simulator import pendant, simulated_kuka
+from tests.support.arms.ur_simulator import address
+from tests.support.rig.patience import PATIENT_KUKA
 from tests.support.rig.simulator_process import simulator
 
 
@@ -206,3 +212,82 @@ def test_a_grbl_machine_of_which_nothing_is_known_is_not_served(tmp_path: Path) 
         simulator("grbl", "--replay", str(file)),
     ):
         pass
+
+
+# --- KUKA ---
+
+
+def arm_section(host: str) -> dict[str, object]:
+    return {"driver": "kuka_sunrise", "host": host, **PATIENT_KUKA}
+
+
+def timeless(device: RecordedDevice) -> RecordedDevice:
+    """The arm without its clock."""
+    assert device.report is not None
+    (sample,) = device.answers.samples
+    fields = {name: values for name, values in sample.fields.items() if name != "time_s"}
+    answers = device.answers.model_copy(update={"samples": (sample.model_copy(update={"fields": fields}),)})
+    report = replace(device.report, clock_offset_s=None)
+    return device.model_copy(update={"answers": answers, "report": report})
+
+
+@pytest.mark.parametrize(
+    ("options", "orders", "named"),
+    [
+        (("--mode", "T1", "--initial-joints=0.1,0.4,-0.2,-1.1,0.3,1.2,-0.5"), ("override 40",), ()),
+        (
+            ("--model", "LBR iiwa 14"),
+            ("stop external_stop",),
+            ("state, safety safeguard_stop: the wire's own word was not recorded; served as external_stop",),
+        ),
+        ((), ("stop protective_stop",), ()),
+    ],
+)
+def test_a_kuka_is_the_same_on_the_replay_of_its_recording(
+    tmp_path: Path, options: tuple[str, ...], orders: tuple[str, ...], named: tuple[str, ...]
+) -> None:
+    with simulated_kuka(address(65), *options) as ready:
+        for order in orders:
+            pendant(ready["host"], order)
+        first = recorded(tmp_path / "first.json", "arm", arm_section(ready["host"]))
+    with simulated_kuka(address(66), "--replay", str(tmp_path / "first.json")) as ready:
+        again = recorded(tmp_path / "again.json", "arm", arm_section(ready["host"]))
+    assert timeless(again) == timeless(first)
+    assert again.answers.samples[0].fields["time_s"] > first.answers.samples[0].fields["time_s"]
+    assert ready["not_served"] == ["greeting, serial number: (serial number 1)", *named]
+
+
+def test_another_kuka_says_what_was_recorded_of_it(tmp_path: Path) -> None:
+    """Its serial number, its software, and that it is not ready, which no option of the simulator says."""
+    greeting = json.dumps({"model": "LBR Med 14", "serial": "77", "software": "Sunrise.OS Med 2.6"})
+    device = RecordedDevice.model_validate(
+        {
+            "kind": "robot",
+            "driver": "kuka_sunrise",
+            "answers": {
+                "exchanges": [
+                    {"question": "greeting", "answer": greeting},
+                    {"question": "state", "answer": "mode T2, safety normal, ready False, locked True"},
+                ]
+            },
+        }
+    )
+    changed(tmp_path / "other.json", device, {})
+    with simulated_kuka(address(66), "--replay", str(tmp_path / "other.json")) as ready:
+        config = KukaConfig.model_validate({"host": ready["host"], **PATIENT_KUKA})
+        arm = hosted(RobotArm, "drivers.kuka:DRIVER", config, call_timeout_s=60, name="robot")
+        try:
+            identity = arm.open()
+            report = arm.report()
+        finally:
+            arm.close()
+    assert (identity.serial, identity.firmware) == ("77", "Sunrise.OS Med 2.6")
+    assert report.details["operating mode"] == "T2"
+    assert any("ready" in problem for problem in report.problems)
+    changed(tmp_path / "mute.json", device, {"greeting": ""})
+    changed(tmp_path / "unknown.json", device, {"greeting": greeting.replace("Med 14", "Max 99")})
+    for file, why in (("mute", "did not tell its greeting"), ("unknown", "is a 'LBR Max 99'; there is LBR Med 14")):
+        words = ("kuka", "--replay", str(tmp_path / f"{file}.json"))
+        with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*words):
+            pass
+        assert why in str(refused.value)
