@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import serial
-from typer.testing import CliRunner
 
 from drivers.errors import DeviceRefusedError, DeviceTimeoutError
 from drivers.host.hosted_device import hosted
@@ -16,23 +15,12 @@ from drivers.interfaces import RobotArm, answers_of
 from drivers.kuka import KukaConfig
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.recording import RecordedDevice, Recording, readable
-from service.cli.main import app
 from tests.support.arms.grbl_simulator import LIFT, TURN, grbl_config, opened, table
 from tests.support.arms.kuka_simulator import pendant, simulated_kuka
 from tests.support.arms.ur_simulator import address
+from tests.support.rig.doctor_recording import recorded
 from tests.support.rig.patience import PATIENT_KUKA
 from tests.support.rig.simulator_process import simulator
-
-
-def recorded(file: Path, name: str, section: dict[str, object]) -> RecordedDevice:
-    """Have the doctor write a recording of a rig of one device."""
-    rig = file.with_suffix(".yaml")
-    rig.write_text(json.dumps({"name": "a lab", "devices": {name: section}}))
-    words = ["--rig", str(rig), "--data", str(file.parent / "data"), "--record", str(file), "--json"]
-    result = CliRunner().invoke(app, ["doctor", *words], catch_exceptions=False)
-    assert name in json.loads(result.stdout)["devices"]
-    (device,) = Recording.model_validate_json(file.read_text(encoding="utf-8")).devices.values()
-    return device
 
 
 def changed(file: Path, device: RecordedDevice, answers: dict[str, str]) -> None:
