@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from drivers.recording import RecordedDevice, Recording, readable
 from tests.support.rig.camera_simulator import camera_simulator
 from tests.support.rig.doctor_recording import recorded
 from tests.support.rig.gphoto_rig import driver, gphoto_rig
+from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.rig.simulator_process import simulator
 
 # Numbers of image formats as libgphoto2 has them: a byte for each file; fine and normal JPEG, RAW, and RAW with JPEG.
@@ -73,6 +75,21 @@ def test_a_canon_is_the_same_on_the_replay_of_what_the_doctor_recorded(tmp_path:
     assert again.report.details == first.report.details
     assert again.report.problems == first.report.problems
     assert again.report.battery_fraction == first.report.battery_fraction
+
+
+@pytest.mark.slow
+def test_a_rig_serves_a_recorded_canon(tmp_path: Path) -> None:
+    with camera_simulator([], "--fast", "--battery", "31", name="canon") as running:
+        section: dict[str, object] = {"driver": "gphoto", "port": running.gphoto_port}
+        recorded(tmp_path / "first.json", "body", section)
+    (tmp_path / "rig").mkdir()
+    words = ("--scene", "7", "--image-width", "480", "--replay", str(tmp_path / "first.json"))
+    with simulated_rig(tmp_path / "rig", *words, host="127.0.0.11") as rig:
+        answer = orthocapture("doctor", "--rig", rig["rig"], "--data", str(tmp_path / "data"), "--json")
+        assert not [words for words in rig["not_served"] if "simulated as in any rig" in words]
+    camera = json.loads(answer.stdout)["devices"]["camera"]
+    assert camera["identity"]["model"] == "Canon EOS R5"
+    assert camera["battery_fraction"] == 0.25
 
 
 def test_what_another_body_stated_is_what_the_driver_reads(tmp_path: Path) -> None:
