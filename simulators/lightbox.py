@@ -66,7 +66,7 @@ def serve(args: argparse.Namespace) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Make:
-    """What a box is, and what it says after power-up. Answers to questions stand without the name of the quantity."""
+    """Holds identity and state of a box after power-up. Answers stand without the name of the quantity."""
 
     model: str  # maker and model, with a comma between them
     serial: str
@@ -84,11 +84,11 @@ class Make:
 
 
 def _recorded(device: RecordedDevice) -> Make:
-    """The box of a recording. Raises SimulatorError for one that did not tell what it is."""
+    """The box of a recording. Raises SimulatorError for a box without an identity."""
     answers = device.exchanges
     fields = [part.strip() for part in answers.pop("*IDN?", "").split(",")]
     if len(fields) != 4:
-        raise SimulatorError(f"{device.name} did not tell its identity: there is nothing to serve")
+        raise SimulatorError(f"{device.name} stated no identity: there is nothing to serve")
     maker, model, serial, firmware = fields
     not_served: list[str] = []
     if TAKEN_OUT.search(serial):

@@ -40,11 +40,11 @@ class RecordedDevice:
 
     def lines(self, question: str) -> tuple[str, ...]:
         """All lines with which a question was answered."""
-        return tuple(one["answer"] for one in self.answers.get("exchanges", ()) if one["question"] == question)
+        return tuple(said["answer"] for said in self.answers.get("exchanges", ()) if said["question"] == question)
 
     @property
     def silent(self) -> tuple[str, ...]:
-        """What was asked in vain when it was recorded, each with the reason."""
+        """Return the questions that were asked in vain, each with the reason."""
         return tuple(self.answers.get("silent", ()))
 
     def sample(self, source: str) -> dict[str, tuple[float, ...]]:

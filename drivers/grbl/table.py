@@ -131,9 +131,9 @@ class GrblTable:
         )
 
     def answers(self) -> DeviceAnswers:
-        """Ask for settings and build, as `open` does, and tell the last status.
+        """Ask for settings and build, as `open` does, and give the last status.
 
-        After an `open` that failed because of them, it is what the controller told it.
+        If `open` failed because of them, returns what the controller answered then.
         """
         if self._link is None and self._told:
             return DeviceAnswers(exchanges=self._told)
@@ -378,5 +378,5 @@ class GrblTable:
 
 def _exchanges(question: str, answers: Iterable[Setting | Feedback]) -> list[Exchange]:
     """The lines of an answer, each with its question."""
-    lines = (f"${one.number}={one.value:.12g}" if isinstance(one, Setting) else f"[{one.text}]" for one in answers)
+    lines = (f"${a.number}={a.value:.12g}" if isinstance(a, Setting) else f"[{a.text}]" for a in answers)
     return [Exchange(question=question, answer=line) for line in lines]

@@ -24,8 +24,10 @@ class ImageFormat:
 
 def of_number(number: int) -> ImageFormat:
     """The format of libgphoto2's number: a byte for each of two files, four bits of size and four of compression."""
-    files = [one for one in (number >> 8 & 0xFF, number & 0xFF) if one != _NO_FILE]
-    return ImageFormat(tuple((RAW_FILE if one & _RAW_BIT else JPEG, _size(one >> 4), one & 0x07) for one in files))
+    files = [byte for byte in (number >> 8 & 0xFF, number & 0xFF) if byte != _NO_FILE]
+    return ImageFormat(
+        tuple((RAW_FILE if byte & _RAW_BIT else JPEG, _size(byte >> 4), byte & 0x07) for byte in files)
+    )
 
 
 def _size(digit: int) -> int:

@@ -179,7 +179,7 @@ class Properties:
         entry.value = value
 
     def put(self, code: Code, value: int) -> None:
-        """Change a value from inside the camera, and tell it, if it is one that this body states."""
+        """Change a value from inside the camera, and announce it if this body states it."""
         with self._lock:
             entry = self._entries.get(code)
             if isinstance(entry, Number):

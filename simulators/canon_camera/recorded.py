@@ -42,7 +42,7 @@ class Formats:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """What a body states."""
+    """Holds the properties of a body and its identity."""
 
     entries: Mapping[int, Number | Formats | str]  # in its order
     model: str = MODEL

@@ -29,7 +29,7 @@ class Controller:
         machine: the machine that it drives.
         send: sends bytes to the host.
         faults: which messages fail; the device is `grbl`, messages are `?`, `jog`, or the line itself.
-        said: what it says of itself.
+        said: settings that it lists, version and build.
     """
 
     def __init__(
@@ -206,8 +206,8 @@ class Controller:
                     )
                 self._say("ok")
             case "$I":
-                for told in self._said.build:
-                    self._say(told)
+                for line_of_build in self._said.build:
+                    self._say(line_of_build)
                 self._say("ok")
             case "$X":
                 if self._state == "Alarm":

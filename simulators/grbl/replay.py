@@ -20,7 +20,7 @@ _PER_AXIS = 100  # settings from here on: ten numbers for each quantity, one for
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What a controller says of itself."""
+    """Holds version, build and settings as a controller states them."""
 
     version: str  # as in its welcome
     build: tuple[str, ...]  # lines of the answer to `$I`
@@ -42,7 +42,7 @@ def recorded(device: RecordedDevice) -> tuple[Said, dict[int, float]]:
     version = next((found["build"] for line in build if (found := _BUILD.fullmatch(line))), "")
     stated = _VERSION.match(version)
     if not settings or stated is None:
-        raise SimulatorError(f"{device.name} did not tell settings and version: there is nothing to serve")
+        raise SimulatorError(f"{device.name} stated no settings or no version: there is nothing to serve")
     beyond = [number for number in settings if number >= _PER_AXIS and number % 10 >= AXES]
     if beyond:
         numbers = ", ".join(f"${number}" for number in beyond)

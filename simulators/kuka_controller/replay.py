@@ -71,7 +71,7 @@ def recorded(device: RecordedDevice) -> Recorded:
     not_served += [f"stream, {name}" for name in stream if name not in _SERVED]
     not_served += [f"{asked}: {answer}" for asked, answer in answers.items() if asked not in ("greeting", "state")]
     details = cast("dict[str, str]", device.report.get("details", {}))
-    not_served += [f"report, {name}: {words}" for name, words in details.items() if name.startswith("FRI")]
+    not_served += [f"report, {name}: {text}" for name, text in details.items() if name.startswith("FRI")]
     return Recorded(
         model,
         serial,
@@ -93,7 +93,7 @@ def _greeting(name: str, answers: dict[str, str]) -> dict[str, str]:
     except ValueError:
         said = None
     fields = cast("dict[str, object]", said) if isinstance(said, dict) else {}
-    told = {key: value for key in ("model", "serial", "software") if isinstance(value := fields.get(key), str)}
-    if len(told) != 3:
-        raise SimulatorError(f"{name} did not tell its greeting: there is nothing to serve")
-    return told
+    texts = {key: value for key in ("model", "serial", "software") if isinstance(value := fields.get(key), str)}
+    if len(texts) != 3:
+        raise SimulatorError(f"{name} gave no greeting: there is nothing to serve")
+    return texts

@@ -23,8 +23,8 @@ OTHER = CameraSettings(aperture_f=11.0, exposure_s=1 / 15, iso=200, focus_mode="
 
 
 def numbers(code: str, kind: str, value: int, *choices: int, access: str = "rw") -> dict[str, Any]:
-    form = "enum" if choices or code == "d105" else "none"
-    return {"code": code, "type": kind, "access": access, "form": form, "numbers": choices, "value": value}
+    kind_of_list = "enum" if choices or code == "d105" else "none"
+    return {"code": code, "type": kind, "access": access, "form": kind_of_list, "numbers": choices, "value": value}
 
 
 def text(code: str, value: str) -> dict[str, Any]:
@@ -83,10 +83,10 @@ def test_a_rig_serves_a_recorded_canon(tmp_path: Path) -> None:
         section: dict[str, object] = {"driver": "gphoto", "port": running.gphoto_port}
         recorded(tmp_path / "first.json", "body", section)
     (tmp_path / "rig").mkdir()
-    words = ("--scene", "7", "--image-width", "480", "--replay", str(tmp_path / "first.json"))
-    with simulated_rig(tmp_path / "rig", *words, host="127.0.0.11") as rig:
+    options = ("--scene", "7", "--image-width", "480", "--replay", str(tmp_path / "first.json"))
+    with simulated_rig(tmp_path / "rig", *options, host="127.0.0.11") as rig:
         answer = orthocapture("doctor", "--rig", rig["rig"], "--data", str(tmp_path / "data"), "--json")
-        assert not [words for words in rig["not_served"] if "simulated as in any rig" in words]
+        assert not [line for line in rig["not_served"] if "simulated as in any rig" in line]
     camera = json.loads(answer.stdout)["devices"]["camera"]
     assert camera["identity"]["model"] == "Canon EOS R5"
     assert camera["battery_fraction"] == 0.25
@@ -99,10 +99,11 @@ def test_what_another_body_stated_is_what_the_driver_reads(tmp_path: Path) -> No
         report, listing = camera.report(), answers_of(camera).listing
         assert listing is not None
         assert (listing.model, listing.firmware) == ("Canon EOS R8", "3-1.4.0")
-        said = {one.code: one.model_dump(mode="json") for one in listing.properties}
-        assert said.keys() == {one["code"] for one in ANOTHER}
-        for one in ANOTHER:
-            assert said[one["code"]] | {"numbers": tuple(said[one["code"]]["numbers"])} == {"numbers": (), **one}
+        said = {p.code: p.model_dump(mode="json") for p in listing.properties}
+        assert said.keys() == {p["code"] for p in ANOTHER}
+        for stated in ANOTHER:
+            again = said[stated["code"]]
+            assert again | {"numbers": tuple(again["numbers"])} == {"numbers": (), **stated}
         assert report.details["imageformat"] == "M"
         assert report.details["iso"] == "200"
         assert report.battery_fraction == pytest.approx(0.5)
@@ -120,7 +121,7 @@ def test_what_of_a_canons_listing_is_not_served_is_named(tmp_path: Path) -> None
         listing = answers_of(camera).listing
         camera.close()
     assert listing is not None
-    assert {one.code for one in listing.properties} == {one["code"] for one in (*ANOTHER, UNSERVED[2])}
+    assert {p.code for p in listing.properties} == {p["code"] for p in (*ANOTHER, UNSERVED[2])}
     with simulator("canon", "--port", "0", "--replay", str(file)) as started:
         assert started.ready["not_served"] == [
             "d1a0: of a structure that is not known",
@@ -136,7 +137,7 @@ def test_what_of_a_canons_listing_is_not_served_is_named(tmp_path: Path) -> None
         ((UNSERVED[1],), "Canon.Inc", "holds no property of a Canon EOS"),
     ],
 )
-def test_what_is_no_canon_is_refused_in_words(
+def test_what_is_no_canon_is_refused(
     tmp_path: Path, properties: tuple[dict[str, Any], ...], maker: str, why: str
 ) -> None:
     file = written(tmp_path / "other.json", *properties, maker=maker)

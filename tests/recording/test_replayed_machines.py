@@ -23,13 +23,17 @@ from tests.support.rig.patience import PATIENT_KUKA
 from tests.support.rig.simulator_process import simulator
 
 
+def by_question(device: RecordedDevice) -> dict[str, str]:
+    return {exchange.question: exchange.answer for exchange in device.answers.exchanges}
+
+
 def changed(file: Path, device: RecordedDevice, answers: dict[str, str]) -> None:
     """Write a recording in which other answers stand to some questions, or none for an empty one."""
     said = device.answers
     exchanges = tuple(
-        one.model_copy(update={"answer": answers.get(one.question, one.answer)})
-        for one in said.exchanges
-        if answers.get(one.question, one.answer)
+        exchange.model_copy(update={"answer": answers.get(exchange.question, exchange.answer)})
+        for exchange in said.exchanges
+        if answers.get(exchange.question, exchange.answer)
     )
     other = device.model_copy(update={"answers": said.model_copy(update={"exchanges": exchanges})})
     file.write_text(readable(Recording(by="a test", devices={device.kind: other})), encoding="utf-8")
@@ -57,7 +61,7 @@ def test_a_light_box_is_the_same_on_the_replay_of_its_recording(tmp_path: Path, 
     assert again.report is not None
     assert again.report.identity.firmware == firmware
     assert again.report.details["shutter"] == "1"
-    said, heard = ({one.question: one.answer for one in device.answers.exchanges} for device in (first, again))
+    said, heard = (by_question(device) for device in (first, again))
     if firmware == "1.4":  # the pedal's clock goes on from where it was
         assert heard["PEDAL?"].rpartition(" ")[0] == said["PEDAL?"].rpartition(" ")[0]
         assert int(heard["PEDAL?"].rpartition(" ")[2]) >= int(said["PEDAL?"].rpartition(" ")[2])
@@ -102,8 +106,8 @@ def test_another_makers_light_box_says_what_was_recorded_of_it(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("answers", "why"),
     [
-        ({"*IDN?": ""}, "did not tell its identity"),
-        ({"*IDN?": "a,b,c"}, "did not tell its identity"),
+        ({"*IDN?": ""}, "stated no identity"),
+        ({"*IDN?": "a,b,c"}, "stated no identity"),
         ({"PEDAL?": "1 2"}, "neither one number nor three"),
     ],
 )
@@ -123,8 +127,8 @@ def test_a_light_box_of_which_too_little_is_known_is_not_served(
         }
     )
     changed(tmp_path / "other.json", device, answers)
-    words = ("lightbox", "--replay", str(tmp_path / "other.json"))
-    with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*words):
+    command = ("lightbox", "--replay", str(tmp_path / "other.json"))
+    with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*command):
         pass
     assert why in str(refused.value)
 
@@ -150,7 +154,7 @@ def test_a_grbl_machine_is_the_same_on_the_replay_of_its_recording(tmp_path: Pat
     assert again == first
     assert first.report is not None
     assert any("Soft limits are off" in problem for problem in first.report.problems)
-    answers = [one.answer for one in first.answers.exchanges]
+    answers = [exchange.answer for exchange in first.answers.exchanges]
     assert {"$100=1234.568", "$103=10", "Alarm"} <= set(answers)
     assert running.ready["not_served"] == [
         "$I: [VER:1.1h.20190825:(serial number 1)]",
@@ -162,7 +166,7 @@ def test_a_grbl_machine_whose_settings_do_not_suit_is_refused_on_its_replay_as_w
     with table(tmp_path, "--setting", "22=0", "110=720.5") as port:
         first = recorded(tmp_path / "first.json", "table", table_section(port))
     assert "homing is off" in first.error
-    assert "$110=720.5" in [one.answer for one in first.answers.exchanges]
+    assert "$110=720.5" in [exchange.answer for exchange in first.answers.exchanges]
     port = tmp_path / "again"
     with simulator("grbl", "--link", str(port), "--replay", str(tmp_path / "first.json")):
         assert recorded(tmp_path / "again.json", "table", table_section(port)) == first
@@ -196,7 +200,7 @@ def test_a_grbl_machine_of_which_nothing_is_known_is_not_served(tmp_path: Path) 
     file = tmp_path / "mute.json"
     file.write_text(readable(Recording(by="a test", devices={"robot": device})), encoding="utf-8")
     with (
-        pytest.raises(AssertionError, match="did not tell settings and version"),
+        pytest.raises(AssertionError, match="stated no settings or no version"),
         simulator("grbl", "--replay", str(file)),
     ):
         pass
@@ -274,8 +278,8 @@ def test_another_kuka_says_what_was_recorded_of_it(tmp_path: Path) -> None:
     assert any("ready" in problem for problem in report.problems)
     changed(tmp_path / "mute.json", device, {"greeting": ""})
     changed(tmp_path / "unknown.json", device, {"greeting": greeting.replace("Med 14", "Max 99")})
-    for file, why in (("mute", "did not tell its greeting"), ("unknown", "is a 'LBR Max 99'; there is LBR Med 14")):
-        words = ("kuka", "--replay", str(tmp_path / f"{file}.json"))
-        with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*words):
+    for file, why in (("mute", "gave no greeting"), ("unknown", "is a 'LBR Max 99'; there is LBR Med 14")):
+        command = ("kuka", "--replay", str(tmp_path / f"{file}.json"))
+        with pytest.raises(AssertionError, match="no ready line") as refused, simulator(*command):
             pass
         assert why in str(refused.value)
