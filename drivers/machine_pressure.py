@@ -1,6 +1,6 @@
-"""How long processes of this machine were kept from running, for want of a processor or memory, as Linux counts it.
+"""Measures how long processes had to wait for a processor or for memory, as Linux counts it.
 
-Where the system tells nothing of this, the answer is that nothing was kept waiting.
+Where the system does not count this, the answer is that nothing had to wait.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class ProcessorTime:
 
 
 def processor_time(thread: int, process: int | str = "self") -> ProcessorTime:
-    """The times of one thread (its native id) since it began. Raises OSError where no system tells them."""
+    """Return the times of one thread (its native id) since it began. Raises OSError where they are not counted."""
     words = Path(f"/proc/{process}/task/{thread}/schedstat").read_text().split()
     return ProcessorTime(seconds_of_ns(int(words[0])), seconds_of_ns(int(words[1])))
 
 
 def processor_times(process: int | str) -> dict[int, ProcessorTime]:
-    """The times of every living thread of a process, by its native id; empty where no system tells them."""
+    """Return the times of every living thread of a process, by its native id; empty where they are not counted."""
     found: dict[int, ProcessorTime] = {}
     try:
         threads = [int(entry.name) for entry in Path(f"/proc/{process}/task").iterdir()]
@@ -47,7 +47,7 @@ def processor_times(process: int | str) -> dict[int, ProcessorTime]:
 
 
 def memory_stall_s() -> float:
-    """Seconds since boot in which all that was to run waited for memory at once; 0 where nothing tells them."""
+    """Return the seconds since boot in which all that was to run waited for memory; 0 where they are not counted."""
     try:
         told = re.search(r"^full .*total=(\d+)", _MEMORY.read_text(), re.MULTILINE)
     except OSError:
@@ -56,7 +56,7 @@ def memory_stall_s() -> float:
 
 
 def killed_for_memory() -> int:
-    """How many processes the kernel has killed for want of memory since boot; 0 where nothing tells it."""
+    """Return how many processes the kernel has killed for want of memory since boot; 0 where it does not count."""
     try:
         told = re.search(r"^oom_kill (\d+)", _KILLED.read_text(), re.MULTILINE)
     except OSError:
@@ -66,14 +66,14 @@ def killed_for_memory() -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What a look at a thread shows: its times, and since when it has been ready without running; None: it sleeps."""
+    """Holds the times of a thread at a look, and since when it has been ready without running; None: it sleeps."""
 
     times: ProcessorTime
     waits_since_s: float | None
 
 
 def _is_ready(thread: int, process: int | str) -> bool:
-    """Whether a thread runs, or would if it had a processor; False where no system tells it."""
+    """Return whether a thread runs, or would if it had a processor; False where the system does not say."""
     try:
         status = Path(f"/proc/{process}/task/{thread}/stat").read_text()
     except OSError:
@@ -83,7 +83,7 @@ def _is_ready(thread: int, process: int | str) -> bool:
 
 @dataclass
 class HeldUp:
-    """Measures, from when it is made, how long a process was kept from running.
+    """Measures, from when it is made, how long a process could not run.
 
     Linux counts a wait for a processor when it ends. A thread that was ready at two looks, without having run in
     between, has waited since the first of them: `look` often enough, and a wait that goes on counts as well.
@@ -123,7 +123,7 @@ class HeldUp:
 
     @property
     def share(self) -> float:
-        """Of the time in which its threads wanted to run, the part in which they could not: 0 to 1."""
+        """Return the part, 0 to 1, of the time in which its threads wanted to run and could not."""
         computed_s = waited_s = 0.0
         for thread, times in self._now().items():
             computed_s += times.computed_s - self._before(thread).computed_s

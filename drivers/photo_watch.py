@@ -173,7 +173,7 @@ class PhotoWatch:
         self._raws, self._alone = paired(jpegs, [path for path in self._seen if not _is_jpeg(path)])
 
     def _arrives(self, path: Path, since_utc_s: float) -> bool:
-        """Whether this photograph is still arriving: its file changes, is incomplete, or lacks its raw file."""
+        """Say whether this photograph is still arriving: its file changes, is incomplete, or lacks its raw file."""
         seen = self._seen[path]
         waited_s = self._monotonic() - seen.since_s
         if seen.done:

@@ -10,7 +10,7 @@ from service.core.picture_files import JPEG_BEGINS, PNG_BEGINS, check_jpeg, chec
 from service.core.records.entered import NoteTaken, paragraphs
 from service.core.records.events import Event
 from service.core.units import megabytes
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.store.records import NewArtefact
 
 PHOTOGRAPH_BYTES = 16_000_000

@@ -14,7 +14,7 @@ from service.core.run.actions import needs_leave
 from service.core.run.state import RunState, connected_arms, lost_arms
 from service.core.text.words import reason_of
 from service.dataset.registrations import best_registration
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 

@@ -101,6 +101,7 @@ PLACES = {
     "service/web/home/history.py": _STAMP,
     "service/web/home/pages.py": "last word of a runner",
     "service/web/site.py": "last word of a runner",
+    "service/web/page/charts.py": _STAMP,
     "service/web/page/robot_banner.py": "last word of a runner",
     "service/web/page/run_frame.py": "last word of a runner",
     "service/web/people/account.py": _STAMP,

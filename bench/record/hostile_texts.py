@@ -155,7 +155,7 @@ def _obeyed(printed: str) -> str:
 
 
 def _verdict(printed: str, place: str) -> str:
-    """Whether a text made a line of its own. A document keeps its lines; `audit verify` gives one verdict itself."""
+    """Say whether a text made a line of its own. Documents keep their lines; `audit verify` has one verdict."""
     most = 1 if place.startswith("verify") or place == "a document" else 0
     made = sum(line.startswith("Verified") for line in printed.splitlines())
     return "a line of a text reads like a verdict" if made > most else ""

@@ -24,7 +24,7 @@ from bench.soak.creep import CHILD, FEWEST, Sample, judge, warmed_up
 from bench.soak.person import Typist
 from service.core.records.events import Payload, ViewpointCaptured
 from service.core.run.state import RunState
-from service.run_record import RunFollower
+from service.followed_run import RunFollower
 from service.run_start import recorded_run
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -7,7 +7,7 @@ from typing import IO
 
 from service.core.records.events import StepFailed
 from service.core.run.decide import AskOperator, decide
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 
 _WATCHDOG = ("LeaveNeededError", "no sign of life")  # error, and words of its message
 

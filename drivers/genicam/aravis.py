@@ -54,7 +54,7 @@ class AravisCamera:
             self._unref(camera)
 
     def _controls(self) -> bool:
-        """Whether the camera takes settings from here. By GigE Vision one program controls, and others may read."""
+        """Say whether the camera takes settings from here: with GigE Vision one program controls, others read."""
         device, is_controller = (
             getattr(self._aravis, f"arv_{name}") for name in ("camera_get_device", "gv_device_is_controller")
         )

@@ -180,7 +180,7 @@ class KukaRobot:
         return flange_pose(self._arm or self._not_open(), joints_rad)
 
     def _frame_problems(self, state: State) -> list[str]:
-        """Whether the flange is where the joints have it; not asked of a moving arm, as the two are read in turn."""
+        """Say whether the flange is where the joints have it; for an arm at rest, as the two are read in turn."""
         apart_m = float(np.linalg.norm((self._pose_of(state.joints_rad) - state.T_base_flange)[:3, 3]))
         if state.motion or apart_m < FRAME_TOLERANCE_M:
             return []

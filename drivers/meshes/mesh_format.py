@@ -241,7 +241,7 @@ def _ends_line(path: Path) -> bool:
 
 
 def _cut_line(lines: list[bytes]) -> bool:
-    """Whether the last of these lines, which has no newline, is less complete than the previous one of its kind."""
+    """Say whether the last line, which has no newline, is less complete than the previous one of its kind."""
     keyword, *values = lines[-1].split()
     if lines[-1].endswith(b"\\") and keyword in _LEAST:
         return True

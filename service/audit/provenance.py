@@ -12,11 +12,12 @@ from sqlalchemy import Connection, text
 
 from service.audit.background import IncrementalResults, PartialResult
 from service.audit.record.rows import EventRow, head, plain, read_rows
-from service.audit.record.search import ArtefactRow, artefacts_of_events, one_artefact
+from service.audit.record.search import artefacts_of_events, one_artefact
 from service.core.jobs import Each, Reference, references_in
 from service.core.records.events import FilesKept, JobEnqueued
 from service.jobs import job_kinds
 from service.store.events import parse_canonical
+from service.store.records import Artefact
 from service.store.store import Store
 
 CHUNK = 500  # events in one step, after which waiting pages come first
@@ -197,14 +198,14 @@ def _connect(graph: Graph, source: str, target: str) -> None:
 class Origin:
     """The origin of a file, and what was made from it."""
 
-    records: Sequence[ArtefactRow]  # the first says where it came from
+    records: Sequence[Artefact]  # the first says where it came from
     event: EventRow  # the event that brought it
     job: EventRow | None  # job_enqueued event of the computation that made it
-    inputs: Sequence[ArtefactRow]  # the files that it was computed or decoded from
+    inputs: Sequence[Artefact]  # the files that it was computed or decoded from
     input_count: int
-    beside: Sequence[ArtefactRow]  # other artefacts of the same event
+    beside: Sequence[Artefact]  # other artefacts of the same event
     used_by: Sequence[EventRow]  # events that name it, LISTED of them at most
-    made_of_it: Sequence[ArtefactRow]  # results of computations that used it
+    made_of_it: Sequence[Artefact]  # results of computations that used it
 
 
 LISTED = 50
@@ -218,6 +219,7 @@ def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
     inputs, count = _inputs(connection, run_id, job) if job else _decoded_from(connection, run_id, event, records[0])
     uses = [seq for seq in _naming(connection, run_id, sha256) if seq != event.seq]
     used_by = read_rows(connection, run_id, uses)
+    brought = artefacts_of_events(connection, run_id, [event.seq])
     jobs = [row.job for row in used_by if row.kind == "job_enqueued"]
     return Origin(
         records=records,
@@ -225,7 +227,7 @@ def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
         job=job,
         inputs=inputs,
         input_count=count,
-        beside=[row for row in artefacts_of_events(connection, run_id, [event.seq]) if row.sha256 != sha256][:LISTED],
+        beside=[row for row in brought if row.ref.sha256 != sha256][:LISTED],
         used_by=used_by,
         made_of_it=artefacts_of_events(connection, run_id, sorted(_ends(connection, run_id, jobs)))[:LISTED],
     )
@@ -257,7 +259,7 @@ def _ends(connection: Connection, run_id: str, jobs: Sequence[str]) -> Iterator[
                 yield row.seq
 
 
-def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[ArtefactRow], int]:
+def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Artefact], int]:
     named = list(dict.fromkeys([*_HASH.findall(job.shown), *_listed(connection, run_id, job)]))
     rows = connection.execute(
         text(
@@ -268,7 +270,7 @@ def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Ar
     ).scalars()
     places = list(rows)
     first = artefacts_of_events(connection, run_id, sorted({place // 1000 for place in places[:LISTED]}))
-    return [row for row in first if row.sha256 in set(named)][:LISTED], len(places)
+    return [row for row in first if row.ref.sha256 in set(named)][:LISTED], len(places)
 
 
 def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]:
@@ -288,9 +290,7 @@ def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]
                 ).scalars()
 
 
-def _decoded_from(
-    connection: Connection, run_id: str, event: EventRow, row: ArtefactRow
-) -> tuple[list[ArtefactRow], int]:
+def _decoded_from(connection: Connection, run_id: str, event: EventRow, row: Artefact) -> tuple[list[Artefact], int]:
     """Find the originals of a file that a driver decoded: those stored before it in the same step from its device."""
     kept = event.record(FilesKept)
     if kept is None or kept.note.startswith(_KEPT_AS_IT_CAME):
@@ -305,7 +305,7 @@ def _decoded_from(
             "step": row.step,
             "attempt": row.attempt,
             "device": row.device,
-            "kind": row.kind,
+            "kind": row.ref.kind,
             "seq": row.seq,
         },
     ).scalars()

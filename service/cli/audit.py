@@ -39,10 +39,10 @@ from service.core.gates.release import release_meaning
 from service.core.text.person_names import cleaned_name
 from service.core.text.words import counted
 from service.core.units import megabytes
+from service.followed_run import read_log
 from service.people.authorisation import Identity
 from service.people.person import ROLES, NotAllowedError, Permission, may
 from service.run_acts import release_run, require_releasable
-from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.access import kept_to
 from service.store.durable_effects import utc_text

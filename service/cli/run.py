@@ -54,6 +54,7 @@ from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.entered import about_run
 from service.core.run.fold import fold
 from service.core.run.state import RunState
+from service.followed_run import RunFollower
 from service.logs.file_log import file_log
 from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
@@ -61,7 +62,7 @@ from service.people.approvals import approve
 from service.people.authorisation import Identity
 from service.people.sessions import People
 from service.rig import Rig, load_rig
-from service.run_record import RunFollower, results_to_come
+from service.run_record import results_to_come
 from service.run_start import (
     recorded_rig,
     recorded_run,

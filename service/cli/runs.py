@@ -10,9 +10,11 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from service.audit.filters import RESULTS, RunSearch
+from service.audit.record.rows import plain
 from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
 from service.audit.runs.history import history, history_csv
-from service.audit.runs.search import RESULT_WORDS, RESULTS, FoundRun, RunSearch, find_runs
+from service.audit.runs.search import RESULT_WORDS, FoundRun, find_runs
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -27,7 +29,7 @@ from service.cli.common import (
 )
 from service.core.gates.measure_names import measure_name
 from service.core.text.words import counted
-from service.run_record import read_log
+from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
 
@@ -46,7 +48,7 @@ def runs_command(
     """List the recorded runs, newest first: all, or those that match."""
     if result and result not in RESULTS:
         raise typer.BadParameter(f"{result!r} is not one of {', '.join(RESULTS)}", param_hint="--result")
-    wanted = RunSearch(search, _day(since, "--since"), _day(until, "--until"), result)
+    wanted = RunSearch(q=plain(search), since=_day(since, "--since"), until=_day(until, "--until"), result=result)
     with reporting_errors(json), Store.open(data, create=False) as store:
         found = find_runs(store, wanted)
     if json:
@@ -59,14 +61,15 @@ def runs_command(
     for heading in ("run", "started (UTC)", "specimen", "purpose", "protocol", "by", "result"):
         table.add_column(heading)
     for run in found:
-        cells = (run.about.specimen, run.about.purpose, f"{run.protocol} {run.version}", by(run), result_words(run))
-        table.add_row(run.run_id, run.created_utc[:16].replace("T", " "), *cells)
+        basics, about = run.basics, run.basics.about
+        cells = (about.specimen, about.purpose, f"{basics.protocol} {basics.version}", by(run), result_words(run))
+        table.add_row(basics.run_id, basics.created_utc[:16].replace("T", " "), *cells)
     print_table(table)
 
 
 def by(run: FoundRun) -> str:
     """Return who worked at the rig or, if that was not given, who started the run."""
-    return run.about.operator or run.begun_by
+    return run.basics.about.operator or run.basics.operator
 
 
 def result_words(run: FoundRun) -> str:
@@ -74,18 +77,20 @@ def result_words(run: FoundRun) -> str:
     words = [RESULT_WORDS[run.status]]
     if run.accuracy is not None:
         words.append(run.accuracy.words)
-    return ", ".join([*words, *(["released"] if run.released else [])]) + (" · simulated" if run.simulated else "")
+    words += ["released"] if run.released else []
+    return ", ".join(words) + (" · simulated" if run.basics.simulated else "")
 
 
 def _record(run: FoundRun) -> dict[str, object]:
+    basics = run.basics
     return {
-        "run": run.run_id,
-        "created_utc": run.created_utc,
-        "simulated": run.simulated,
-        "protocol": run.protocol,
-        "version": run.version,
-        "begun_by": run.begun_by,
-        "about": run.about.model_dump(),
+        "run": basics.run_id,
+        "created_utc": basics.created_utc,
+        "simulated": basics.simulated,
+        "protocol": basics.protocol,
+        "version": basics.version,
+        "begun_by": basics.operator,
+        "about": basics.about.model_dump(),
         "notes": list(run.notes),
         "status": run.status,
         "released": run.released,
@@ -143,10 +148,8 @@ _PARTS = ("about", "accuracy", "gates", "calibration", "durations", "measures")
 
 def _compared(store: Store, name: str) -> ComparedRun:
     run_id = store.find_run(name)
-    protocol, root = recorded_run(store, run_id)
-    source = store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
-    log = read_log(store, run_id, protocol)
-    return ComparedRun(run_id, root, protocol, source, log.events, log.state)
+    protocol, _ = recorded_run(store, run_id)
+    return ComparedRun.of(read_log(store, run_id, protocol))
 
 
 def _comparison_record(comparison: RunComparison) -> dict[str, object]:

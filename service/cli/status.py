@@ -25,8 +25,9 @@ from service.core.recovery import takes_words, ways_on
 from service.core.run.expected import tries_words
 from service.core.run.state import RunState, StepState, lost_arms
 from service.core.text.words import time_utc
+from service.followed_run import read_log
 from service.jobs import live_summary, live_view
-from service.run_record import open_jobs, read_log, results_to_come
+from service.run_record import open_jobs, results_to_come
 from service.run_start import recorded_run
 from service.steps.coats import coats
 from service.steps.live_numbers import describe_view

@@ -46,7 +46,7 @@ class RecordedReport:
 
 @dataclass(frozen=True, slots=True)
 class RecordedOptics:
-    """Camera, lens and settings in a photograph's EXIF (the field `camera` of a View); "" or None: not given."""
+    """Camera, lens and settings as a photograph states them (the field `camera` of a View); "" or None: not given."""
 
     model: str = ""
     body_serial: str = ""
@@ -54,7 +54,12 @@ class RecordedOptics:
     lens_serial: str = ""
     focal_length_mm: float | None = None
     aperture_f: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
     focus_mode: str = ""
+    focus_distance_m: float | None = None
+    width: int | None = None
+    height: int | None = None
     exif_time: str = ""
 
 
@@ -83,7 +88,7 @@ def recorded_report(report: object) -> RecordedReport:
 
 
 def recorded_optics(camera: object) -> RecordedOptics:
-    """Return the `camera` of a view's event. Zero stands for a length or f-number that the camera does not know."""
+    """Return the `camera` of a view's event. Zero stands for a number that the camera does not know."""
     fields = _mapping(camera)
     return RecordedOptics(
         model=_text(fields.get("model")),
@@ -92,7 +97,12 @@ def recorded_optics(camera: object) -> RecordedOptics:
         lens_serial=_text(fields.get("lens_serial")),
         focal_length_mm=_number(fields.get("focal_length_mm")) or None,
         aperture_f=_number(fields.get("aperture_f")) or None,
+        exposure_s=_number(fields.get("exposure_s")) or None,
+        iso=_number(fields.get("iso")) or None,
         focus_mode=_text(fields.get("focus_mode")),
+        focus_distance_m=_number(fields.get("focus_distance_m")) or None,
+        width=int(_number(fields.get("width")) or 0) or None,
+        height=int(_number(fields.get("height")) or 0) or None,
         exif_time=_text(fields.get("exif_time")),
     )
 

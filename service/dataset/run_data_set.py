@@ -63,7 +63,7 @@ def data_set_of(
     """
     own, registered, files = _registered(summary)
     truth = summary.ground_truth()
-    mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
+    mesh = truth.mesh
     stated_errors = view_covariances(summary, own, registered, sorted(files))
     taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
     first = [

@@ -10,16 +10,17 @@ from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.compute.ground_truth.surface import read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply
 from service.core.protocol.models import Protocol
-from service.core.records.events import ArtefactRef, Event, JobFinished, RecordedView, RunStarted
+from service.core.records.events import ArtefactRef, JobFinished, RecordedView
 from service.core.run.fold import fold
+from service.core.run.folded import FoldedRun
 from service.core.run.state import JobState, RunState
 from service.core.units import metres
+from service.dataset.records import Mesh
 from service.dataset.registrations import (
     better_later,
     budgets,
@@ -69,28 +70,18 @@ class GroundTruth:
     Attributes:
         words: a text on what it is.
         sha256: hash of its file.
-        vertices_m: (V, 3) the vertices in the frame of the scan.
-        faces: (F, 3) indices of the vertices of each face.
-        source, sigma_m: (V,) source and standard deviation of each vertex, as the fusion gave them; None for a scan.
+        mesh: the mesh in the frame of the scan; a scan has neither sources nor standard deviations.
     """
 
     words: str
     sha256: str
-    vertices_m: Array = field(repr=False)
-    faces: NDArray[np.int64] = field(repr=False)
-    source: NDArray[np.uint8] | None = field(default=None, repr=False)
-    sigma_m: Array | None = field(default=None, repr=False)
+    mesh: Mesh = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class RunSummary:
-    """The record of one run."""
+class RunSummary(FoldedRun):
+    """The record of one run, and what reads its files."""
 
-    run_id: str
-    protocol: Protocol
-    root: RunStarted
-    state: RunState
-    events: Sequence[Event]
     store: ArtefactReader
 
     def registrations(self) -> Mapping[str, Registration]:
@@ -158,19 +149,17 @@ class RunSummary:
             vertices_m, faces = self.scan_mesh()
             scan = self.scan_mesh_file()
             sha256 = "" if scan is None else scan.sha256
-            return GroundTruth("scan", sha256, np.asarray(vertices_m, dtype=np.float64), faces.astype(np.int64))
+            return GroundTruth("scan", sha256, Mesh(np.asarray(vertices_m, dtype=np.float64), faces.astype(np.int64)))
         columns, faces = read_ply(self.store.artefact_path(fused[-1].sha256))
         vertices_mm = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
         source, sigma_m = columns["source"].astype(np.uint8), metres(columns["sigma_mm"].astype(np.float64))
-        return GroundTruth("CT and scan, fused", fused[-1].sha256, metres(vertices_mm), faces, source, sigma_m)
+        return GroundTruth("CT and scan, fused", fused[-1].sha256, Mesh(metres(vertices_mm), faces, source, sigma_m))
 
 
 def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:
     """Read a run and fold its events."""
     events = store.events(run_id)
-    root = events[0].payload
-    assert isinstance(root, RunStarted)  # service.run_start has checked it
-    return RunSummary(run_id, protocol, root, fold(protocol, events), events, store)
+    return RunSummary(run_id, protocol, events, fold(protocol, events), store)
 
 
 MESH = "ground_truth_mesh"  # kind of the mesh's artefact

@@ -49,7 +49,7 @@ def _one_thread() -> None:
 
 @dataclass(frozen=True, slots=True)
 class ChildLimits:
-    """What a child may take, besides what it has when its modules are imported.
+    """Limits what a child may take, besides what it has when its modules are imported.
 
     Attributes:
         memory_bytes: the memory.

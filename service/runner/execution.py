@@ -21,13 +21,12 @@ from service.core.run.state import JobState
 from service.core.text.words import counted
 from service.logs.file_log import at
 from service.monitor.snapshot import living_workers
-from service.run_record import StepEvidence
 from service.runner.held_run import HeldRun
 from service.runner.leave import LeaveWatch
 from service.runner.operator import Operator
 from service.runner.upkeep import DiskWatch
 from service.steps import step_kinds
-from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
+from service.steps.context import Devices, Evidence, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 from service.store.durable_effects import Clock, moment_of
 
 _LOG = logging.getLogger(__name__)
@@ -145,7 +144,7 @@ class StepExecution:
             attempt=attempt,
             run=self.run.state,
             devices=self.devices,
-            evidence=StepEvidence(
+            evidence=Evidence(
                 self.run.follower,
                 self.run.lease,
                 step.id,

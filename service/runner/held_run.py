@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from service.core.protocol.models import Protocol
 from service.core.records.events import Payload
 from service.core.run.state import RunState
-from service.run_record import RunFollower
+from service.followed_run import RunFollower
 from service.store.runs import RunLease
 from service.store.store import Store
 

@@ -15,7 +15,7 @@ from service.core.disk_space import Forecast, Verdict
 from service.core.errors import IntegrityError, StoreError
 from service.core.protocol.models import Protocol
 from service.core.records.events import DeviceTrouble, StepNote
-from service.run_record import RunFollower
+from service.followed_run import RunFollower
 from service.runner.held_run import HeldRun
 from service.runner.operator import Operator
 from service.steps.context import Devices

@@ -19,8 +19,8 @@ from drivers.interfaces import (
     Scanner,
     Transform,
 )
-from service.core.errors import OrthocaptureError
-from service.core.jobs import Each, Reference
+from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
+from service.core.jobs import Each, Reference, arguments_name, job_key
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
 from service.core.protocol.step_params import StepParams
@@ -29,10 +29,14 @@ from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record
 from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import WAITED, JobState
+from service.followed_run import RunFollower
+from service.jobs import term
 from service.jobs.kind import JobKind, JobRecord
+from service.jobs.memory_grants import waiting_for_memory
 from service.rig import CollisionSection, FurtherCameraSection, LensSection, ObstacleSection, OpticsSection
 from service.steps.measures import MeasureRecord
-from service.store.records import NewArtefact
+from service.store.records import NewArtefact, NewJob
+from service.store.runs import RunLease
 
 P = TypeVar("P", bound=StepParams)
 A = TypeVar("A", bound=JobRecord)
@@ -217,60 +221,120 @@ class JobResult:
         return ComputedBy(job=self.job)
 
 
-class Evidence(Protocol):
-    """A step's access to the record. It raises if recording fails, so that nothing is done unrecorded."""
+@dataclass
+class Evidence:
+    """A step's access to the record during one execution; if recording fails it raises, so nothing is unrecorded."""
 
-    def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "") -> None:
-        """Append events (and artefact rows) in one transaction."""
-        ...
+    log: RunFollower
+    lease: RunLease
+    step: str
+    attempt: int
+    checkpoint: Callable[[], None]
+    progress: Callable[[str, int, int], None]
+    wait: Callable[[float], None]
+    space: Callable[[], None]
+
+    def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "runner") -> None:
+        """Append events and artefact rows in one transaction."""
+        self.log.store.record(self.log.run_id, payloads, actor=actor, artefacts=artefacts, lease=self.lease)
 
     def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Copy a file into the content-addressed store."""
-        ...
+        """Copy a file into the store durably; nothing refers to it until `record`."""
+        return self.log.store.put_file(path, kind=kind, media_type=media_type, original_name=original_name)
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Write bytes into the content-addressed store."""
-        ...
+        """Write bytes into the store durably; nothing refers to them until `record`."""
+        return self.log.store.put_bytes(data, kind=kind, media_type=media_type, original_name=original_name)
 
     def path(self, ref: ArtefactRef) -> Path:
-        """Return the file that holds an artefact."""
-        ...
+        """Return the file of an artefact. Raises IntegrityError if it is missing."""
+        return self.log.store.artefact_path(ref.sha256)
 
     def holds(self, sha256: str) -> bool:
-        """Return whether a file with these bytes is in the evidence of this run already."""
-        ...
+        """Return whether the run has recorded a file with this content."""
+        return self.log.store.holds(self.log.run_id, sha256)
 
     def captures(self, step_id: str) -> tuple[RecordedView, ...]:
-        """Return the valid captures of a step's current attempt, up to this moment, in order."""
-        ...
+        """Return the valid captures of a step's current attempt, in the order of capture."""
+        return self.log.now().captures(step_id)
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
-        """Enqueue jobs, only once even after restarts, and wait for the worker's results, in order."""
-        ...
+        """Enqueue jobs, each only once also after restarts, and wait for their results, returned in order.
+
+        Raises ComputeError with the worker's message if a job failed for good.
+        """
+        keys = [self._key(request) for request in requests]
+        jobs = [
+            NewJob(r.kind, self.step, self.attempt, key, r.arguments, priority=r.priority, version=r.version)
+            for r, key in zip(requests, keys, strict=True)
+        ]
+        self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
+        while True:
+            self.checkpoint()
+            self.space()  # workers begin no jobs while the disk is nearly full
+            state = self.log.refresh()
+            mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
+            if any(key not in mine for key in keys):
+                raise IntegrityError(
+                    "a job just enqueued is not in the record",
+                    where=f"step {self.step}",
+                    remedy="Run `orthocapture audit verify` on the data folder",
+                )
+            for key in keys:
+                if mine[key].status == "failed":
+                    raise ComputeError(
+                        f"the worker could not do {term(mine[key].kind)}: {mine[key].message}",
+                        where=f"step {self.step}",
+                        remedy="Correct what the message names, or take what is missing; then try again",
+                    )
+            done = sum(mine[key].status == "finished" for key in keys)
+            waiting = waiting_for_memory(self.log.store.database_path.parent)
+            left = [mine[key] for key in keys if mine[key].status != "finished"]
+            doing = dict.fromkeys(f"{term(job.kind)} {waiting.get(job.job, '')}".rstrip() for job in left)
+            self.progress(", ".join(doing) or "computed", done, len(keys))
+            if done == len(keys):
+                return tuple(JobResult.of(mine[key]) for key in keys)
+            self.wait(0.2)
 
     def enqueue(self, request: JobRequest, name: str) -> None:
-        """Enqueue a job without waiting for it: once for each `name`, and again if it has failed."""
-        ...
+        """Enqueue a job without waiting for it, unless the same work is already enqueued under this name."""
+        key = job_key(self.log.refresh(), self.step, request.kind, name)
+        if all(job.idempotency_key != key for job in self.jobs(self.step)):
+            job = NewJob(
+                request.kind,
+                self.step,
+                self.attempt,
+                key,
+                request.arguments,
+                priority=request.priority,
+                version=request.version,
+            )
+            self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """Return the requests of people to this step on the pages so far, in order."""
-        ...
+        """Return what people at screens have asked of this step, in order."""
+        return self.log.refresh().steps[self.step].asked
 
     def computing(self) -> bool:
         """Return whether a worker computes a job of this run at this moment."""
-        ...
+        return bool(self.log.store.jobs_started(self.log.run_id))
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
-        """Return the jobs of a step in their present state, in the order in which they were enqueued."""
-        ...
+        """Return the jobs of a step, in the order in which they were enqueued."""
+        jobs = self.log.refresh().steps[step_id].jobs.values()
+        return tuple(sorted(jobs, key=lambda job: job.enqueued_seq))
 
     def state(self) -> RunState:
-        """Return the present state of the run."""
-        ...
+        """Return the run's state as of now. Raises IntegrityError for an impossible event."""
+        return self.log.refresh()
 
     def require_space(self) -> None:
-        """Call before each photograph. Raises SpaceShortError if the disk would soon be full."""
-        ...
+        """Raise SpaceShortError if the disk is nearly full."""
+        self.space()
+
+    def _key(self, request: JobRequest) -> str:
+        """Return the same key for the same work, so that a restart or retry reuses the result."""
+        return job_key(self.log.refresh(), self.step, request.kind, arguments_name(request.arguments))
 
 
 @dataclass(frozen=True, slots=True)

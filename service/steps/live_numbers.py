@@ -19,7 +19,7 @@ from service.core.records.events import FurtherExposure, Record, RecordedView, V
 from service.core.run.state import LIVE, JobState
 from service.core.units import metres, rad_of_mrad
 from service.jobs import calibrate, coverage_points, further_view, live_summary, live_view, locate_spheres
-from service.jobs.records import Camera, Hash, ImageFile, Limits, Matrix, Mounting, Point, PosedPhotograph, image_of
+from service.jobs.records import Hash, ImageFile, Limits, Mounting, Point, PosedPhotograph, image_of
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, earlier_answer, mounting_of, with_robot_pose
 from service.steps.notes import SPOILT, SUGGESTION, suggested_views
@@ -134,8 +134,9 @@ class LiveAnalysis:
             return None
         analysis = cls(context, params, shared)
         if not any(job.kind == "coverage_points" for job in analysis._jobs("coverage_points")):
+            live = shared.values
             arguments = coverage_points.Arguments(
-                mesh=mesh, spheres_m=shared.spheres_m, radius_m=shared.radius_m, limits=shared.limits
+                mesh=mesh, spheres_m=live.spheres_m, radius_m=live.radius_m, limits=live.limits
             )
             references = {"spheres_m": shared.taken["spheres_m"]}
             request = JobRequest.of(coverage_points.KIND, arguments, references, LIVE)
@@ -154,7 +155,8 @@ class LiveAnalysis:
             mounted = mounting_of(self.context, [self.params.hand_eye], [capture.station])
             earlier, looks = self._earlier()
             arguments = live_view.Arguments(
-                **self.shared.arguments(mounted.mounting).set_fields(),
+                **self.shared.values.set_fields(),
+                **mounted.mounting.set_fields(),
                 image=with_robot_pose(image, capture),
                 surface=self._surface(),
                 earlier=earlier,
@@ -162,7 +164,7 @@ class LiveAnalysis:
             references = {**self.shared.taken, **mounted.references, "earlier": looks}
             request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
             self.context.evidence.enqueue(request, sha256)
-        look_at_further(self.context, self.shared.spheres_m, self.shared.radius_m, self.shared.taken)
+        look_at_further(self.context, self.shared.values.spheres_m, self.shared.values.radius_m, self.shared.taken)
         self._tell()
 
     def summary(
@@ -182,7 +184,8 @@ class LiveAnalysis:
         least = coverage_gate.min if coverage_gate and coverage_gate.min is not None else 0.0
         views, looks = self._earlier()
         arguments = live_summary.Arguments(
-            **self.shared.arguments(self.shared.mounting).set_fields(),
+            **self.shared.values.set_fields(),
+            **self.shared.mounting.set_fields(),
             surface=self._surface(),
             views=views,
             station=station,
@@ -302,7 +305,7 @@ class LiveAnalysis:
         by_image = {image_of(j).sha256: j for j in self._jobs("live_view") if j.status == "finished"}
         captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
         hashes = [capture.artefacts[0].sha256 for capture in captures]
-        width = self.shared.camera.width
+        width = self.shared.values.camera.width
         jobs = [by_image[sha256] for sha256 in hashes if sha256 in by_image]
         return [
             ImageSharpness.of(job, black=live_view.KIND.read_answer(job.result).black, width=width) for job in jobs
@@ -376,14 +379,8 @@ class SharedArguments:
     the arm's correction, if there is one, because the poses of the images are corrected too.
     """
 
-    camera: Camera
+    values: live_view.LiveArguments  # without the mounting, which is another at other stations
     mounting: Mounting
-    hand_eye_covariance: Matrix
-    arm_sigma_m: float
-    arm_sigma_rad: float
-    spheres_m: tuple[Point, ...]
-    radius_m: float
-    limits: Limits
     taken: Mapping[str, Reference | Each | None]
 
     @classmethod
@@ -403,34 +400,24 @@ class SharedArguments:
         sigma_m = metres(_rms(best.residuals.held_out_mm.values()))
         sigma_rad = float(np.radians(_rms(best.residuals.held_out_deg.values())))
         at = "hand_eye" if record.arm_correction is None else "hand_eye/arm_correction"
-        return cls(
+        values = live_view.LiveArguments(
             camera=calibration.answer.camera,
-            mounting=Mounting(T_flange_camera=best.T_flange_camera),
             hand_eye_covariance=best.sigma.covariance,
             arm_sigma_m=sigma_m if params.arm_sigma_mm is None else metres(params.arm_sigma_mm),
             arm_sigma_rad=sigma_rad if params.arm_sigma_mrad is None else rad_of_mrad(params.arm_sigma_mrad),
             spheres_m=scan.answer.spheres_m,
             radius_m=metres(context.protocol.spheres.radius_mm),
             limits=Limits.model_validate(params.coverage.model_dump()),
+        )
+        return cls(
+            values,
+            Mounting(T_flange_camera=best.T_flange_camera),
             taken={
                 "camera": calibration.reference("camera"),
                 "spheres_m": scan.reference("spheres_m"),
                 "hand_eye_covariance": hand_eye.reference(f"{at}/sigma/covariance"),
                 "T_flange_camera": hand_eye.reference(f"{at}/T_flange_camera"),
             },
-        )
-
-    def arguments(self, mounting: Mounting) -> live_view.LiveArguments:
-        """Return what the arguments of all jobs share, with the mounting at a station."""
-        return live_view.LiveArguments(
-            camera=self.camera,
-            **mounting.set_fields(),
-            hand_eye_covariance=self.hand_eye_covariance,
-            arm_sigma_m=self.arm_sigma_m,
-            arm_sigma_rad=self.arm_sigma_rad,
-            spheres_m=self.spheres_m,
-            radius_m=self.radius_m,
-            limits=self.limits,
         )
 
 

@@ -17,10 +17,10 @@ from fastapi import Path as UrlPath
 
 from service.core.errors import ConfigurationError
 from service.core.run.expected import EarlierTimes
+from service.followed_run import RunFollower, RunRecord
 from service.monitor.snapshot import Snapshot, log_path, write_snapshot
 from service.people.sessions import People
 from service.rig import Rig, RigDevice
-from service.run_record import RunFollower, RunRecord
 from service.run_start import recorded_run, require_rig_free, second_place
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store

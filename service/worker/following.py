@@ -12,7 +12,8 @@ from service.core.gates.release import late_s
 from service.core.jobs import jobs_of, references_in, resolve
 from service.core.records.events import Event
 from service.core.run.fold import advance
-from service.run_record import RunFollower, recorded_protocol, recorded_root
+from service.followed_run import RunFollower
+from service.run_record import recorded_protocol, recorded_root
 from service.steps.due_jobs import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint

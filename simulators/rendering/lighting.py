@@ -47,7 +47,7 @@ def disk(samples: int) -> Array:
 
 
 def blocked_rays(caster: Caster, vertices: Array, normals: Array, lamp_m: Array) -> Bools:
-    """Whether something occludes each sample of lamp and room, per vertex: (LAMP_SAMPLES + ROOM_SAMPLES, V)."""
+    """Say whether something occludes each sample of lamp and room, per vertex: (LAMP_SAMPLES + ROOM_SAMPLES, V)."""
     start = (vertices + 4e-4 * normals).astype(np.float32)
     towards_lamp = (
         (lamp_m + np.array([dx, dy, 0.0]) - vertices).astype(np.float32)

@@ -10,8 +10,9 @@ import pytest
 
 from bench.soak.large_record import STEP, LargeRecord
 from service.core.records.events import StepNote
-from service.run_record import RunFollower, StepEvidence, read_log
+from service.followed_run import RunFollower, read_log
 from service.run_start import recorded_run
+from service.steps.context import Evidence
 from service.store.verification.verify import show
 from service.web.capture.view import views_of
 from tests.support.record.counting import lines_of
@@ -50,7 +51,7 @@ def capture_page(record: LargeRecord) -> Callable[[], object]:
 def held_already(record: LargeRecord) -> Callable[[], object]:
     log = RunFollower(record.store, record.run_id, recorded_run(record.store, record.run_id)[0])
     lease = record.store.lease(record.run_id, "test", 60)
-    evidence = StepEvidence(log, lease, STEP, 1, lambda: None, lambda *_: None, lambda _s: None, lambda: None)
+    evidence = Evidence(log, lease, STEP, 1, lambda: None, lambda *_: None, lambda _s: None, lambda: None)
     last = record.store.artefacts(record.run_id)[-1].ref.sha256
     assert evidence.holds(last)
     assert not evidence.holds("0" * 64)

@@ -19,7 +19,7 @@ from service.cli.main import app
 from service.core.records.events import DeviceOpened
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.home.history import TimePoint, time_chart
+from service.web.page.charts import TimePoint, time_chart
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run
@@ -112,7 +112,9 @@ def test_figures_over_time_by_camera_lens_and_arm(tmp_path: Path) -> None:
             identity = {"kind": "camera", "model": "ILCE-7RM5", "serial": serial, "driver": "gphoto"}
             store.record(run_id, [DeviceOpened(device="camera", report={"identity": identity})], actor="runner")
         found = by_instrument(history(store))
-    names = {f"{one.kind} {one.model} {one.serial}": [row.run.run_id for row in rows] for one, rows in found.items()}
+    names = {
+        f"{one.kind} {one.model} {one.serial}": [row.run.basics.run_id for row in rows] for one, rows in found.items()
+    }
     assert names == {
         "camera ILCE-7RM5 1234567": runs[:2],
         "camera ILCE-7RM5 7654321": runs[2:],

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 from service.core.geometry import Array, apply
 from service.core.records.events import RegionDrawn
 from service.dataset.scene_view import viewing_frame
-from service.run_record import read_log
+from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
 from service.web.scene.data import scene_of

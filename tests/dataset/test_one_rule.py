@@ -19,7 +19,7 @@ from service.dataset.records import DataSet
 from service.dataset.registrations import own_registration, registrations, signed_rows
 from service.dataset.run_data_set import data_set_of
 from service.dataset.view_covariances import pose_covariance
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.outlines import displayed_registration, scan_spheres
@@ -66,7 +66,7 @@ def store(run: RecordedRun) -> Iterator[Store]:
 
 
 def page_of(run: RecordedRun, store: Store) -> RunRecord:
-    return RunRecord(store, run.run_id, run.protocol, tuple(run.events), run.state)
+    return RunRecord(run.run_id, run.protocol, tuple(run.events), run.state, store)
 
 
 def test_every_reader_takes_the_registration_that_the_evaluation_judged_best(run: RecordedRun, store: Store) -> None:

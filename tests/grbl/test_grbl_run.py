@@ -77,6 +77,7 @@ def rig_with_table(simulated: str, port: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 def test_a_run_with_the_turntable_instead_of_the_arm(tmp_path: Path) -> None:
     folder, data, protocol = tmp_path / "rig", tmp_path / "data", tmp_path / "turntable.yaml"
     folder.mkdir()

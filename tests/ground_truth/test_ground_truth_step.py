@@ -156,7 +156,7 @@ def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: B
     summary = summarise(bench.store, bench.run_id, loaded.protocol)
     fusion = recorded_fusion(summary)
     assert fusion is not None
-    exported = summary.ground_truth()
+    exported = summary.ground_truth().mesh
     assert exported.source is not None
     assert np.array_equal(exported.source, columns["source"])
     assert exported.sigma_m == pytest.approx(1e-3 * columns["sigma_mm"], rel=1e-6)

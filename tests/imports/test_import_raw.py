@@ -49,6 +49,7 @@ def protocol(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 @pytest.mark.timeout(1200)
 def test_a_run_develops_its_raw_files_and_measures_in_them(folder: Path, protocol: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"

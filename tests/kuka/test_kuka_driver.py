@@ -23,12 +23,12 @@ from drivers.errors import (
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCriteria
 from drivers.kuka import KukaConfig
-from service.core.arms.kuka.lbr_med_14 import ARM as LBR_MED_14
+from service.core.arms.model import arm_model
 from service.core.arms.model import flange_pose as forward
 from service.core.arms.seven_axes import nearest_posture, postures
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from simulators.kuka_controller.kinematics import MODELS, frames
-from tests.support.arms.confirming import confirmed
+from tests.support.arms.confirming import confirm_and
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
 from tests.support.arms.sunrise import sunrise_engine
 from tests.support.arms.ur_simulator import address
@@ -150,14 +150,14 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) ->
     host = address(73)
     with controller(host, patience_s=0), opened(host, unattended_s=0.3) as arm, Lateness() as lateness:
         start = arm.state().sample.joints_rad[0]
-        confirmed(arm, lambda: move(arm, turned(arm, 2.5)))
+        confirm_and(arm, lambda: move(arm, turned(arm, 2.5)))
         time.sleep(1.5)
         with pytest.raises(LeaveNeededError, match="nobody had looked"):
             wait_for(lambda: not arm.is_moving())
         assert arm.state().sample.joints_rad[0] - start < STOPPED_BY_RAD + LATE_TIMES * lateness.worst_s
         with pytest.raises(LeaveNeededError):
             move(arm, turned(arm, 0.1))
-        confirmed(arm, lambda: travel(arm, turned(arm, 0.1)))
+        confirm_and(arm, lambda: travel(arm, turned(arm, 0.1)))
 
 
 @pytest.mark.realtime
@@ -167,7 +167,7 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
     with controller(host, patience_s=0), opened(host) as arm, Lateness() as lateness:
         driver = driver_pid(arm)
         start = arm.state().sample.joints_rad[0]
-        confirmed(arm, lambda: move(arm, turned(arm, 2.5)))
+        confirm_and(arm, lambda: move(arm, turned(arm, 2.5)))
         os.kill(driver, signal.SIGSTOP)
         try:
             time.sleep(1.5)
@@ -179,7 +179,7 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
         assert arm.state().sample.joints_rad[0] - start < STOPPED_BY_RAD + LATE_TIMES * lateness.worst_s
         with pytest.raises(LeaveNeededError):
             move(arm, turned(arm, 0.1))
-        confirmed(arm, lambda: travel(arm, turned(arm, 0.1)))
+        confirm_and(arm, lambda: travel(arm, turned(arm, 0.1)))
 
 
 def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
@@ -236,7 +236,7 @@ def test_a_lost_link_is_unavailable_and_opens_again() -> None:
 
 
 def test_seven_axes_reach_every_pose_within_their_limits() -> None:
-    arm, random = LBR_MED_14, np.random.default_rng(7)
+    arm, random = arm_model("LBR Med 14"), np.random.default_rng(7)
     limits = np.array(arm.limits_rad)
     for _ in range(100):
         q = random.uniform(-limits, limits)
@@ -252,7 +252,7 @@ def test_seven_axes_reach_every_pose_within_their_limits() -> None:
 
 
 def test_the_elbow_moves_clear_of_a_limit() -> None:
-    arm = LBR_MED_14
+    arm = arm_model("LBR Med 14")
     free = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 0.9, 0.0])
     at_limit = postures(arm, forward(arm, free))
     room = np.array(arm.limits_rad) - np.abs(at_limit)

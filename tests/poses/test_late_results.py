@@ -41,8 +41,8 @@ from service.core.records.events import (
 from service.core.run.fold import fold
 from service.core.run.state import LATER
 from service.dataset.registrations import late_results, shared_adjustment_note
+from service.followed_run import RunRecord, read_log
 from service.rig import load_rig
-from service.run_record import RunRecord, read_log
 from service.run_start import start_run
 from service.steps import params_models
 from service.steps.due_jobs import missing_results

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ from service.cli.status import status_record
 from service.core.gates.release import late_s, late_words
 from service.core.geometry import look_at
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
-from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, RunStarted
+from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished
 from service.core.run.fold import fold, initial_state
 from service.core.run.state import LATER, REDUCED, WAITED, JobState, Note, RunState
 from service.dataset.registrations import better_later, evaluated, own_registration, registrations
 from service.dataset.summary import RunSummary
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.steps.due_jobs import due, missing_results
@@ -264,9 +264,8 @@ def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> No
     steps["evaluation"] = replace(steps["evaluation"], result={"table": rows, "budgets": {}})
     judged = replace(run.state, steps=steps)
     with Store.open(tmp_path) as store:
-        shown = [displayed_registration(RunRecord(store, "a", run.protocol, (), state)) for state in (begun, judged)]
-        root = cast(RunStarted, None)
-        reported = [RunSummary("a", run.protocol, root, state, (), store).best() for state in (begun, judged)]
+        shown = [displayed_registration(RunRecord("a", run.protocol, (), state, store)) for state in (begun, judged)]
+        reported = [RunSummary("a", run.protocol, (), state, store).best() for state in (begun, judged)]
     assert [None if one is None else one.name for one in shown] == ["colmap", "colmap_640x360"]
     assert reported == [None, "colmap_640x360"], "nothing is reported or exported that was not evaluated"
 

@@ -63,6 +63,7 @@ def drivers_of(runner: subprocess.Popen[bytes]) -> list[psutil.Process]:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 def test_a_killed_driver_ends_no_run_and_it_is_resumed_on_a_pressed_machine(tmp_path: Path) -> None:
     """Other signals are told in the same way: tests/robot/test_host.py."""
     data, log = tmp_path / "data", tmp_path / "run.log"

@@ -81,6 +81,7 @@ def run(folder: Path, faults: Sequence[Mapping[str, Any]], *wanted: str, host: s
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 def test_a_covered_board_a_blurred_and_a_black_image_are_taken_again_at_once(tmp_path: Path) -> None:
     first_view = BOARDS + 1 + 1  # one additional board image is taken
     faults = (

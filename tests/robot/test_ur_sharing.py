@@ -11,7 +11,7 @@ from drivers.errors import DeviceRefusedError, DeviceUnavailableError, LeaveNeed
 from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import RobotArm
 from tests.support.arms.arm_watch import watched_arm
-from tests.support.arms.confirming import confirmed
+from tests.support.arms.confirming import confirm_and
 from tests.support.arms.ur_driver import SPEED_UP, move, opened, travel, turned
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
@@ -92,9 +92,9 @@ def test_a_driver_that_was_cut_off_says_so_and_moves_again_only_for_a_person(mov
     host = address(95 + moving)
     rig = simulated_ur(host, "--cut-off", "0.5", patience_s=1.0)
     with rig, opened(host, **IMPATIENT) as arm, watched_arm(host) as watch:
-        confirmed(arm, lambda: travel(arm, turned(arm, 0.05)))
+        confirm_and(arm, lambda: travel(arm, turned(arm, 0.05)))
         if moving:
-            confirmed(arm, lambda: move(arm, turned(arm, 2.5)))
+            confirm_and(arm, lambda: move(arm, turned(arm, 2.5)))
             watch.wait_moving(0.3)
         os.kill(pid_of(arm), signal.SIGSTOP)
         watch.wait_resting()
@@ -109,4 +109,4 @@ def test_a_driver_that_was_cut_off_says_so_and_moves_again_only_for_a_person(mov
             move(arm, turned(arm, 0.1))
         watch.pass_s(1.0)
         assert watch.moved_for_s(since) == 0.0
-        confirmed(arm, lambda: travel(arm, turned(arm, 0.1)))
+        confirm_and(arm, lambda: travel(arm, turned(arm, 0.1)))

@@ -15,10 +15,11 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service.audit.bundle.export import export_bundle
+from service.audit.filters import RunSearch
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output import render_html, write_pdf
-from service.audit.runs.search import RunSearch, find_runs
+from service.audit.runs.search import find_runs
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
 from service.core.records.entered import NoteTaken, RunAbout
@@ -289,7 +290,7 @@ def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     web.store.record(spine, [RunAborted(reason="enough")], actor="runner")
     knee = start(browser, specimen="Knee 3", purpose="Teaching", text="")
     done = web.record_run()
-    find = lambda **wanted: [run.run_id for run in find_runs(web.store, RunSearch(**wanted))]  # noqa: E731
+    find = lambda **wanted: [run.basics.run_id for run in find_runs(web.store, RunSearch(**wanted))]  # noqa: E731
     assert find() == [done, knee, spine]
     assert find(q="spine 7") == [spine]
     assert find(q="KNEE teaching") == [knee]

@@ -11,7 +11,7 @@ import pytest
 
 from service.core.errors import IntegrityError
 from service.core.records.events import StepNote, StepPassed
-from service.run_record import RunFollower
+from service.followed_run import RunFollower
 from service.run_start import recorded_run
 from tests.support.pages.web import WebSite, web_site
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store

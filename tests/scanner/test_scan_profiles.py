@@ -105,7 +105,7 @@ def spheres_are_found(scan: ScannedMesh, tolerance_mm: float) -> None:
     assert distance.min(axis=1).max() < tolerance_mm
 
 
-def test_every_profile_has_its_entry_point_and_advice() -> None:
+def test_every_profile_is_found_by_name_and_has_advice() -> None:
     assert set(profile_names()) >= {*MESHES, "zivid", "photoneo"}
     for name in profile_names():
         profile = profile_named(name)

@@ -183,7 +183,7 @@ STORED_AS: dict[str, Callable[[Store, str, str], None]] = {
 
 
 def can_be_stored_as(place: str, text: str) -> bool:
-    """Whether there are such texts there; in the name of a file a surrogate stands for a byte that is not text."""
+    """Say whether there are such texts; in a file's name a surrogate stands for a byte that is not text."""
     if place != "file's own name":
         return True
     try:
@@ -193,7 +193,7 @@ def can_be_stored_as(place: str, text: str) -> bool:
 
 
 def refused_by_other_databases(data: Path) -> bool:
-    """Whether any row holds NUL or a surrogate, because of which a copy to PostgreSQL would be refused."""
+    """Return whether any row holds NUL or a surrogate, because of which a copy to PostgreSQL would be refused."""
     with closing(sqlite3.connect(data / "orthocapture.sqlite")) as database:
         # The index of words keeps no text that could be read back.
         listed_ = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'event_words%'"

@@ -8,10 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from drivers.scan_profiles import PROFILES
+
 ROOT = Path(__file__).parents[2]
 GROUPS: dict[str, dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
-# A plug-in of the kinds of devices: drivers, and the profiles that some drivers read.
-OF_DEVICES = sorted(name for name in GROUPS if name == "orthocapture.drivers" or name.endswith("_profiles"))
+# What a row stands for: drivers, and the profiles that some drivers read.
+OF_DEVICES: dict[str, set[str]] = {
+    **{name: set(group) for name, group in GROUPS.items() if name == "orthocapture.drivers" or "_profiles" in name},
+    "scan profiles": set(PROFILES),
+}
 _ROW = re.compile(r"^\| `(\w+)` \|(.*)\|$", re.MULTILINE)
 
 
@@ -20,14 +25,14 @@ def rows() -> list[tuple[str, list[str]]]:
     return [(name, [cell.strip() for cell in rest.split("|")]) for name, rest in _ROW.findall(page)]
 
 
-@pytest.mark.parametrize("group", OF_DEVICES)
+@pytest.mark.parametrize("group", sorted(OF_DEVICES))
 def test_each_entry_point_has_one_row(group: str) -> None:
     named = [name for name, _ in rows()]
-    assert {name: named.count(name) for name in GROUPS[group]} == dict.fromkeys(GROUPS[group], 1)
+    assert {name: named.count(name) for name in OF_DEVICES[group]} == dict.fromkeys(OF_DEVICES[group], 1)
 
 
 def test_no_row_names_what_is_not_installed() -> None:
-    assert {name for name, _ in rows()} <= {name for group in OF_DEVICES for name in GROUPS[group]}
+    assert {name for name, _ in rows()} <= set().union(*OF_DEVICES.values())
 
 
 def test_each_row_says_how_the_device_was_tried() -> None:

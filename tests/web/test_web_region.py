@@ -18,8 +18,8 @@ from service.core.records.events import RegionDrawn
 from service.core.run.fold import fold
 from service.core.run.state import JobState
 from service.dataset.scene_view import scene_json, viewing_frame
+from service.followed_run import RunRecord, read_log
 from service.jobs import fuse
-from service.run_record import RunRecord, read_log
 from service.run_start import recorded_run
 from service.web.scene.data import scene_of
 from tests.support.pages.web import Browser, WebSite, web_site
@@ -95,7 +95,7 @@ def test_the_wound_that_the_last_fusion_used_is_outlined(shown: tuple[WebSite, B
         for name, seq, found in (("second", 9, answer), ("first", 7, answer.model_copy(update={"wound_m": ()})))
     }
     steps = {**before.state.steps, "ground_truth": replace(before.state.steps["ground_truth"], jobs=jobs)}
-    log = RunRecord(site.store, run, protocol, tuple(before.events), replace(before.state, steps=steps))
+    log = RunRecord(run, protocol, tuple(before.events), replace(before.state, steps=steps), site.store)
     scene = scene_of(log).scene
     (line,) = (
         trace for trace in json.loads(scene_json(scene))["data"] if trace.get("name") == "wound of the last fusion"

@@ -255,7 +255,7 @@ def _without_effect(node: cst.CSTNode) -> bool:  # noqa: PLR0911 - one rule a re
 
 
 def _is_type(value: cst.BaseExpression) -> bool:
-    """Whether a value is an alias of types: names with a capital, `None`, subscripts of types, joined by `|`."""
+    """Say whether a value is an alias of types: names with a capital, `None`, subscripts of types, joined by `|`."""
     match value:
         case cst.BinaryOperation(left=left, operator=cst.BitOr(), right=right):
             return _is_type(left) and _is_type(right)

@@ -17,7 +17,7 @@ from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, JobFinished, RecordedView, StepMeasured
-from service.run_record import read_log
+from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.database.engine import database_path
 from service.store.disk_space import leftovers, remove_leftovers

@@ -1,4 +1,4 @@
-"""Whether a person had let the arm move at some moment, from the events of its run."""
+"""Return whether a person had let the arm move at some moment, from the events of its run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from service.core.records.events import Event, OperatorAction, SessionStarted
 
 
 def confirmed(events: Sequence[Event], protocol: Protocol, monotonic_s: float) -> bool:
-    """Whether a person had confirmed a step with motions by then, since the program that drove the run started."""
+    """Say whether a person had confirmed a step with motions since the program that drove the run started."""
     moving = {step.id for step in protocol.steps if step.moves_robot}
     leave = False
     for event in events:

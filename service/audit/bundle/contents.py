@@ -19,9 +19,9 @@ from sqlalchemy import Connection, Table, select
 from service.audit.record.run import not_in_yet
 from service.core.errors import DataError, IntegrityError, StoreError
 from service.core.protocol.models import Protocol
-from service.core.records.events import Event, RunStarted
+from service.core.records.events import RunStarted
 from service.core.run.fold import fold
-from service.core.run.state import RunState
+from service.core.run.folded import FoldedRun
 from service.people.rows import full_names
 from service.store.artefacts import chunks_of, read_artefacts
 from service.store.database.tables import artefacts as artefact_table
@@ -191,7 +191,7 @@ class ChainHead:
 
 
 @dataclass(frozen=True, slots=True)
-class BundledRun:
+class BundledRun(FoldedRun):
     """A run as one transaction sees it.
 
     Attributes:
@@ -203,12 +203,8 @@ class BundledRun:
         keys: the site's public keys, oldest first.
     """
 
-    run_id: str
-    root: RunStarted
     head: ChainHead
     site_head: ChainHead
-    events: Sequence[Event]
-    state: RunState
     artefacts: Sequence[Artefact]
     full_names: Mapping[str, str]
     missing: Sequence[str]
@@ -216,14 +212,14 @@ class BundledRun:
 
 
 def read_bundled_run(
-    connection: Connection, run_id: str, protocol: Protocol, root: RunStarted, keys: Sequence[PublicKey]
+    connection: Connection, run_id: str, protocol: Protocol, keys: Sequence[PublicKey]
 ) -> BundledRun:
     """Read what a bundle says about a run."""
     events = read_events(connection, run_id, 0)
     state = fold(protocol, events)
     return BundledRun(
         run_id=run_id,
-        root=root,
+        protocol=protocol,
         head=_head(connection, run_id),
         site_head=_head(connection, SITE),
         events=events,

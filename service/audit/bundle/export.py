@@ -159,7 +159,7 @@ def export_bundle(
     checkpoint(store, SITE)
     keys = public_keys(store)
     with store.database.reading() as connection:
-        run = read_bundled_run(connection, run_id, exportable.protocol, root, keys)
+        run = read_bundled_run(connection, run_id, exportable.protocol, keys)
         left: list[tuple[str, int]] = []
 
         def leave(part: Path) -> None:

@@ -27,29 +27,25 @@ LISTED = 200  # most rows of a list; the timeline has the rest
 
 @dataclass(frozen=True, slots=True)
 class CorrectedValue:
-    """A correction: the original and the new value."""
+    """A correction, and the event that it corrects."""
 
     seq: int
     at_utc: str
     person: str
-    of_seq: int
+    correction: RecordCorrected
     of_kind: str
-    field: str
-    old: Any
-    new: Any
-    reason: str
-    original: Any  # the value in the event; equals `old`
+    original: Any  # the value in the event; equals `correction.old`
     latest: bool  # no later correction of the same value
 
     @property
     def old_text(self) -> str:
         """The original value as text."""
-        return value_text(self.old)
+        return value_text(self.correction.old)
 
     @property
     def new_text(self) -> str:
         """The new value as text."""
-        return value_text(self.new)
+        return value_text(self.correction.new)
 
 
 def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue]:
@@ -69,12 +65,8 @@ def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue
                 seq=row.seq,
                 at_utc=row.at_utc,
                 person=row.actor,
-                of_seq=correction.of_seq,
+                correction=correction,
                 of_kind=event.kind if event else "",
-                field=correction.field,
-                old=correction.old,
-                new=correction.new,
-                reason=correction.reason,
                 original=value_at(event.payload, correction.field) if event else None,
                 latest=last[correction.of_seq, correction.field] == row.seq,
             )

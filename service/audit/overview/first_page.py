@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from service.audit.background import PartialProgress
+from service.audit.filters import RunFilter
 from service.audit.overview.digest import Digest, FailedGate
 from service.audit.record.rows import RunBasics
 from service.audit.verify.verifications import Verification
@@ -126,28 +127,6 @@ def counts(digest: Digest) -> dict[str, int]:
 
 
 # --- the list of runs -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class RunFilter:
-    """A filter for runs; an empty field matches every run."""
-
-    since: str = ""  # 2026-11-21
-    until: str = ""
-    protocol: str = ""
-    person: str = ""
-    status: str = ""
-    simulated: str = ""  # yes, no
-    deviations: bool = False  # only runs with deviations
-    unverified: bool = False  # only runs whose last verification is missing, outdated or found faults
-    q: str = ""
-
-    def query(self) -> dict[str, str]:
-        """Return the filter as query parameters of a link."""
-        names = ("since", "until", "protocol", "person", "status", "simulated", "q")
-        fields = {name: getattr(self, name) for name in names}
-        fields |= {"deviations": "1" if self.deviations else "", "unverified": "1" if self.unverified else ""}
-        return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)

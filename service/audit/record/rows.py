@@ -12,6 +12,7 @@ from sqlalchemy import Connection, text
 
 from service.core.errors import IntegrityError
 from service.core.records.base import Record
+from service.core.records.entered import RunAbout
 from service.core.records.events import RunStarted
 from service.store.events import event_sha256, parse_canonical
 from service.store.records import SITE, UnknownRunError
@@ -32,6 +33,7 @@ class RunBasics:
     version: str
     operator: str
     origin: str  # captured, imported
+    about: RunAbout  # what people entered at its start
     head_seq: int
     head_sha256: str
 
@@ -44,7 +46,7 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
             "json_extract(e.payload, '$.protocol_id') AS protocol, "
             "json_extract(e.payload, '$.protocol_version') AS version, "
             "json_extract(e.payload, '$.operator') AS operator, "
-            "json_extract(e.payload, '$.origin') AS origin "
+            "json_extract(e.payload, '$.origin') AS origin, json_extract(e.payload, '$.about') AS about "
             "FROM runs AS r LEFT JOIN heads AS h ON h.run_id = r.run_id "
             "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
             "WHERE r.run_id <> :site AND (:run IS NULL OR r.run_id = :run) ORDER BY r.created_utc DESC, r.run_id DESC"
@@ -60,11 +62,19 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
             version=str(row.version or ""),
             operator=str(row.operator or ""),
             origin=str(row.origin or "captured"),
+            about=_about(row.about),
             head_seq=row.seq or 0,
             head_sha256=row.sha256 or "",
         )
         for row in rows
     ]
+
+
+def _about(content: str | None) -> RunAbout:
+    try:
+        return RunAbout.model_validate_json(content) if content else RunAbout()
+    except ValidationError:  # the verification reports it
+        return RunAbout()
 
 
 def head(connection: Connection, run_id: str) -> tuple[int, str]:

@@ -11,6 +11,7 @@ from service.core.errors import IntegrityError
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import Event, RunStarted
 from service.core.run.fold import fold
+from service.core.run.folded import FoldedRun
 from service.core.run.state import RunState
 from service.people.rows import full_names, named
 from service.steps import params_models
@@ -37,15 +38,10 @@ class RecordedFiles:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedRun:
-    """A run: its events, their fold, and its files."""
+class RecordedRun(FoldedRun):
+    """A run and its files."""
 
     data_dir: Path
-    run_id: str
-    root: RunStarted
-    protocol: Protocol
-    events: Sequence[Event]
-    state: RunState
     artefacts: Sequence[Artefact]
     files: RecordedFiles
     full_names: Mapping[str, str]  # full names by account, as they are now
@@ -54,7 +50,7 @@ class RecordedRun:
         """Return the run as the functions of the report and of the data set take it."""
         from service.dataset.summary import RunSummary  # noqa: PLC0415 - loads the numerics, which a bundle does without
 
-        return RunSummary(self.run_id, self.protocol, self.root, self.state, self.events, self.files)
+        return RunSummary(self.run_id, self.protocol, self.events, self.state, self.files)
 
     def named(self, account: str) -> str:
         """Return a person by full name and account; a person without an account by the recorded name."""
@@ -88,7 +84,7 @@ def read_run(data_dir: Path, name: str, *, last_seq: int | None = None) -> Recor
     content = files.artefact_path(root.protocol.sha256, verify=True).read_bytes()
     loaded = parse_protocol(content, params_models(), name=root.protocol.original_name)
     state = fold(loaded.protocol, events)
-    return RecordedRun(data_dir, run_id, root, loaded.protocol, events, state, artefacts, files, names)
+    return RecordedRun(run_id, loaded.protocol, events, state, data_dir, artefacts, files, names)
 
 
 def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:

@@ -5,44 +5,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Connection, text
 
+from service.audit.filters import ArtefactFilter, EventFilter
 from service.audit.record.rows import LARGEST_SEQ, PAGE, EventRow, head, plain, read_rows
-from service.store.records import UnknownRunError
-
-
-@dataclass(frozen=True, slots=True)
-class Filter:
-    """Base of filters, whose fields are texts; an empty field matches all."""
-
-    @property
-    def active(self) -> bool:
-        """True if any filter is set."""
-        return bool(self.query())
-
-    def query(self) -> dict[str, str]:
-        """Return the filter as query parameters of a link."""
-        return {name: value for name, value in asdict(self).items() if value}
-
+from service.store.artefacts import to_artefact
+from service.store.records import Artefact, UnknownRunError
 
 COUNT_LIMIT = 10_000  # matches of a filter beyond this number are not counted
 _SEARCH_CHARACTERS = 200
 _SEARCH_TERMS = 8
 _WORD = re.compile(r"[^\W_]")
-
-
-@dataclass(frozen=True, slots=True)
-class EventFilter(Filter):
-    """A filter for events; an empty field matches all."""
-
-    step: str = ""
-    device: str = ""
-    person: str = ""
-    kind: str = ""
-    q: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,47 +195,10 @@ _LARGEST_PAGE = 10**6
 
 
 @dataclass(frozen=True, slots=True)
-class ArtefactFilter(Filter):
-    """A filter for artefacts; an empty field matches all."""
-
-    kind: str = ""
-    step: str = ""
-    device: str = ""
-    viewpoint: str = ""
-    q: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class ArtefactRow:
-    """A recorded artefact."""
-
-    seq: int
-    position: int
-    sha256: str
-    kind: str
-    media_type: str
-    size_bytes: int
-    original_name: str
-    device: str
-    step: str
-    attempt: int | None
-    viewpoint: str
-    who: str
-    at_utc: str
-    monotonic_s: float
-    record_sha256: str
-
-    @property
-    def is_picture(self) -> bool:
-        """True if a browser can show the file."""
-        return self.media_type in ("image/jpeg", "image/png")
-
-
-@dataclass(frozen=True, slots=True)
 class ArtefactPage:
     """A page of artefacts, and the number of pages and matches."""
 
-    rows: Sequence[ArtefactRow]
+    rows: Sequence[Artefact]
     page: int
     pages: int
     count: int
@@ -267,8 +206,8 @@ class ArtefactPage:
 
 
 _COLUMNS = (
-    "seq, position, sha256, kind, media_type, size_bytes, original_name, device, step, attempt, viewpoint, who, "
-    "at_utc, monotonic_s, record_sha256"
+    "run_id, seq, position, sha256, kind, media_type, size_bytes, original_name, device, step, attempt, viewpoint, "
+    "who, at_utc, monotonic_s, record_sha256"
 )
 
 
@@ -293,7 +232,7 @@ def artefacts_page(
         ),
         values | {"limit": size, "offset": (page - 1) * size},
     )
-    return ArtefactPage([to_row(row) for row in rows], page, pages, totals.n, totals.size)
+    return ArtefactPage([to_artefact(row) for row in rows], page, pages, totals.n, totals.size)
 
 
 def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[str, Any]]:
@@ -311,28 +250,7 @@ def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[
     return " AND ".join(conditions), values
 
 
-def to_row(row: Any) -> ArtefactRow:
-    """Return a row of the table `artefacts` as an ArtefactRow."""
-    return ArtefactRow(
-        seq=row.seq,
-        position=row.position,
-        sha256=row.sha256,
-        kind=row.kind,
-        media_type=row.media_type,
-        size_bytes=row.size_bytes,
-        original_name=row.original_name,
-        device=row.device,
-        step=row.step or "",
-        attempt=row.attempt,
-        viewpoint=row.viewpoint or "",
-        who=row.who,
-        at_utc=row.at_utc,
-        monotonic_s=row.monotonic_s,
-        record_sha256=row.record_sha256,
-    )
-
-
-def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]) -> list[ArtefactRow]:
+def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]) -> list[Artefact]:
     """Return the artefacts that these events brought."""
     if not seqs:
         return []
@@ -343,10 +261,10 @@ def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]
         ),
         {"run": plain(run_id), "seqs": str(list(seqs))},
     )
-    return [to_row(row) for row in rows]
+    return [to_artefact(row) for row in rows]
 
 
-def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[ArtefactRow]:
+def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[Artefact]:
     """Return every record of a file in this run; the first says where it came from. Raises UnknownRunError."""
     head(connection, run_id)
     rows = connection.execute(
@@ -356,7 +274,7 @@ def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[Artef
         ),
         {"run": plain(run_id), "sha256": plain(sha256)},
     )
-    found = [to_row(row) for row in rows]
+    found = [to_artefact(row) for row in rows]
     if not found:
         raise UnknownRunError(
             "the run has no artefact of this SHA-256",

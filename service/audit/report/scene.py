@@ -34,30 +34,6 @@ _LEGEND = 44.0  # height below the picture
 _LIGHT = np.array([0.35, -0.75, 0.9])
 
 
-@dataclass(frozen=True, slots=True)
-class _Geometry:
-    """Everything in millimetres of the viewing frame.
-
-    Attributes:
-        points: (V, 3) float32.
-        triangles: (F, 3) uint32.
-        colours: (V, 3) uint8, red first.
-        segments: (N, 2, 3) float32, and `strokes`: (N, 3) uint8.
-        labels: text and where it stands.
-        legend: colour and what it stands for.
-        error_mm: the errors that the first and the last colour of the mesh stand for; None: it has one colour.
-    """
-
-    points: NDArray[np.float32]
-    triangles: NDArray[np.uint32]
-    colours: NDArray[np.uint8]
-    segments: NDArray[np.float32]
-    strokes: NDArray[np.uint8]
-    labels: Sequence[tuple[str, NDArray[np.float32]]]
-    legend: Sequence[tuple[str, str]]
-    error_mm: tuple[float, float] | None
-
-
 def report_scene(summary: RunSummary, *, turning: bool) -> SceneBlock | None:
     """Return cameras, spheres and mesh in one frame; None without a registration. `turning`: also for a browser."""
     best, registrations = summary.best(), summary.registrations()
@@ -93,67 +69,65 @@ def report_scene(summary: RunSummary, *, turning: bool) -> SceneBlock | None:
 
 
 @dataclass(slots=True)
-class _Parts:
-    """The geometry while it is put together; coordinates in millimetres of the viewing frame."""
+class _Geometry:
+    """The drawn scene, in millimetres of the viewing frame.
 
-    points: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
-    triangles: list[NDArray[np.uint32]] = field(default_factory=list[NDArray[np.uint32]])
-    colours: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
-    segments: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
-    strokes: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
+    Attributes:
+        points: (V, 3) corners of the triangles.
+        triangles: (F, 3) indices of points.
+        colours: (V, 3) a colour for each point, red first.
+        segments: (N, 2, 3) ends of the lines.
+        strokes: (N, 3) a colour for each line.
+        labels: text and where it stands.
+        legend: colour and what it stands for.
+        error_mm: the errors that the first and the last colour of the mesh stand for; None: it has one colour.
+    """
+
+    points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    triangles: NDArray[np.uint32] = field(default_factory=lambda: np.zeros((0, 3), np.uint32))
+    colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    segments: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), np.float32))
+    strokes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     labels: list[tuple[str, NDArray[np.float32]]] = field(default_factory=list[tuple[str, NDArray[np.float32]]])
     legend: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    error_mm: tuple[float, float] | None = None
 
     def add_surface(self, points: NDArray[np.float32], faces: NDArray[np.int64], colour: NDArray[np.uint8]) -> None:
         """Add triangles in one colour, or in one for each point."""
-        self.triangles.append((faces + sum(map(len, self.points))).astype(np.uint32))
-        self.points.append(points)
-        self.colours.append(np.broadcast_to(colour, (len(points), 3)))
+        self.triangles = np.concatenate([self.triangles, (faces + len(self.points)).astype(np.uint32)])
+        self.points = np.concatenate([self.points, points])
+        self.colours = np.concatenate([self.colours, np.broadcast_to(colour, (len(points), 3))])
 
     def add_lines(self, segments: NDArray[np.float32], colour: str) -> None:
         """Add line segments (N, 2, 3) in one colour."""
-        self.segments.append(segments)
-        self.strokes.append(np.broadcast_to(_rgb(colour), (len(segments), 3)))
-
-    def geometry(self, error_mm: tuple[float, float] | None) -> _Geometry:
-        """Return all parts as one."""
-        return _Geometry(
-            np.concatenate(self.points),
-            np.concatenate(self.triangles),
-            np.concatenate(self.colours),
-            np.concatenate(self.segments),
-            np.concatenate(self.strokes),
-            self.labels,
-            self.legend,
-            error_mm,
-        )
+        self.segments = np.concatenate([self.segments, segments])
+        self.strokes = np.concatenate([self.strokes, np.broadcast_to(_rgb(colour), (len(segments), 3))])
 
 
 def _geometry(scene: scene_view.Scene) -> _Geometry:
-    to_view = scene_view.viewing_frame(scene)
-    parts = _Parts()
-    error_mm = _add_mesh(parts, scene.mesh, to_view)
+    to_view, parts = scene_view.viewing_frame(scene), _Geometry()
+    _add_mesh(parts, scene.mesh, to_view)
     _add_spheres(parts, scene, to_view)
     _add_cameras(parts, scene, to_view)
     _add_scale_bar(parts)
-    return parts.geometry(error_mm)
+    return parts
 
 
 def _in_view_mm(points_m: Array, to_view: Transform) -> NDArray[np.float32]:
     return mm(apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))).astype(np.float32)
 
 
-def _add_mesh(parts: _Parts, mesh: scene_view.SceneMesh | None, to_view: Transform) -> tuple[float, float] | None:
-    """Add the mesh, coloured by its predicted error, of which the smallest and the largest are returned, mm."""
+def _add_mesh(parts: _Geometry, mesh: scene_view.SceneMesh | None, to_view: Transform) -> None:
+    """Add the mesh, coloured by its predicted error."""
     if mesh is None or mesh.error_mm is None:
-        return None
+        return
     least, most = float(mesh.error_mm.min()), float(mesh.error_mm.max())
     share = (mesh.error_mm - least) / max(most - least, 1e-12)
     parts.add_surface(_in_view_mm(mesh.points_m, to_view), mesh.triangles, _viridis(share))
-    return least, most
+    parts.error_mm = least, most
 
 
-def _add_spheres(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> None:
+def _add_spheres(parts: _Geometry, scene: scene_view.Scene, to_view: Transform) -> None:
     ball, faces = unit_ball()
     radius_mm = mm(scene.radius_m)
     for sphere in scene.spheres:
@@ -165,7 +139,7 @@ def _add_spheres(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> 
     parts.legend += [(scene_view.KINDS[kind], scene_view.KIND_NAMES[kind]) for kind in kinds]
 
 
-def _add_cameras(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> None:
+def _add_cameras(parts: _Geometry, scene: scene_view.Scene, to_view: Transform) -> None:
     """Add the frustums of each station's cameras in a colour of their own."""
     for number, station in enumerate(sorted(set(scene.stations.values()))):
         colour = scene_view.STYLES[number % len(scene_view.STYLES)][0]
@@ -177,13 +151,13 @@ def _add_cameras(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> 
         parts.legend.append((colour, name))
 
 
-def _add_frustums(parts: _Parts, cameras: Sequence[Transform], colour: str) -> None:
+def _add_frustums(parts: _Geometry, cameras: Sequence[Transform], colour: str) -> None:
     path = frustum_lines(cameras).astype(np.float32)
     pairs = np.stack([path[:-1], path[1:]], axis=1)
     parts.add_lines(pairs[np.isfinite(pairs).all(axis=(1, 2))], colour)
 
 
-def _add_scale_bar(parts: _Parts) -> None:
+def _add_scale_bar(parts: _Geometry) -> None:
     bar = scene_view.BAR_MM
     ends = np.array([[[-bar / 2, -300, -60], [bar / 2, -300, -60]]], np.float32)
     parts.add_lines(ends, "#52606d")

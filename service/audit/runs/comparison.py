@@ -9,15 +9,15 @@ from datetime import datetime
 
 import numpy as np
 
-from service.core.errors import IntegrityError
 from service.core.gates.verdict import figure, limits, quantity, standing
 from service.core.geometry import Transform
-from service.core.protocol.models import Protocol
 from service.core.records.entered import ABOUT, RunAbout
-from service.core.records.events import Event, GateVerdict, RunStarted
-from service.core.run.state import RunState, StepState
+from service.core.records.events import GateVerdict
+from service.core.run.folded import FoldedRun
+from service.core.run.state import StepState
 from service.core.units import mm
 from service.dataset.registrations import evaluated
+from service.followed_run import RunRecord
 from service.jobs import calibrate
 from service.jobs.evaluate import Row
 from service.jobs.records import Camera
@@ -33,15 +33,16 @@ _STANDINGS = {
 
 
 @dataclass(frozen=True, slots=True)
-class ComparedRun:
+class ComparedRun(FoldedRun):
     """One of the compared runs."""
 
-    run_id: str
-    root: RunStarted
-    protocol: Protocol
     source: str  # text of the protocol
-    events: Sequence[Event]
-    state: RunState
+
+    @classmethod
+    def of(cls, log: RunRecord) -> ComparedRun:
+        """Return a run with its protocol's text. Raises IntegrityError if the text was altered."""
+        source = log.store.artefact_path(log.root.protocol.sha256, verify=True).read_text("utf-8")
+        return cls(log.run_id, log.protocol, log.events, log.state, source)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +90,6 @@ def compare_runs(first: ComparedRun, second: ComparedRun) -> RunComparison:
         durations=tuple(_durations(first, second)),
         deviations=(_deviations(first), _deviations(second)),
     )
-
-
-def root_of(events: Sequence[Event]) -> RunStarted:
-    """Return the first event of a run. Raises IntegrityError if it is not run_started."""
-    root = events[0].payload if events else None
-    if not isinstance(root, RunStarted):
-        raise IntegrityError("the run's first event is not run_started", where=events[0].run_id if events else "")
-    return root
 
 
 def _row(name: str, first: str, second: str, *, change: str = "", step: str = "") -> ComparedProperty:

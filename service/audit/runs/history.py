@@ -12,7 +12,8 @@ from typing import Literal
 
 from sqlalchemy import Connection, text
 
-from service.audit.runs.search import FoundRun, RunSearch, find_runs
+from service.audit.filters import RunSearch
+from service.audit.runs.search import FoundRun, find_runs
 from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_identity, recorded_optics
 from service.store.store import Store
 
@@ -91,16 +92,20 @@ def history(store: Store) -> list[HistoryRow]:
         optics = _optics(connection)
     rows: list[HistoryRow] = []
     for run in runs:
-        steps = calibrations.get(run.run_id, ())
+        steps = calibrations.get(run.basics.run_id, ())
         values = _values(steps)
         if run.accuracy is not None:
             values["mean_radial_error_mm"] = run.accuracy.error_mm
         if values:
-            at_utc = max((step.at_utc for step in steps), default=run.created_utc)
-            mine = devices.get(run.run_id, {})
+            at_utc = max((step.at_utc for step in steps), default=run.basics.created_utc)
+            mine = devices.get(run.basics.run_id, {})
             rows.append(
                 HistoryRow(
-                    run, at_utc, *_optical(mine, optics.get(run.run_id, RecordedOptics())), _arms(mine, steps), values
+                    run,
+                    at_utc,
+                    *_optical(mine, optics.get(run.basics.run_id, RecordedOptics())),
+                    _arms(mine, steps),
+                    values,
                 )
             )
     return sorted(rows, key=lambda row: row.at_utc)
@@ -226,14 +231,14 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
     instruments = ("camera_model", "camera_serial", "lens", "lens_serial", "arm_models", "arm_serials")
     writer.writerow([*about, *instruments, *_COLUMNS, "mean_radial_error_limit_mm", "accuracy"])
     for row in rows:
-        run, accuracy = row.run, row.run.accuracy
+        run, about, accuracy = row.run.basics, row.run.basics.about, row.run.accuracy
         arms = [" + ".join(getattr(arm, field) for arm in row.arms) for field in ("model", "serial")]
         optical = [
             getattr(one, field) if one else "" for one in (row.camera, row.lens) for field in ("model", "serial")
         ]
         words = (
-            run.run_id, row.at_utc, "yes" if run.simulated else "no", run.status, run.about.specimen,
-            run.about.purpose, run.about.site, run.protocol, run.version, *optical, *arms,
+            run.run_id, row.at_utc, "yes" if run.simulated else "no", row.run.status, about.specimen,
+            about.purpose, about.site, run.protocol, run.version, *optical, *arms,
         )  # fmt: skip
         judged = "" if accuracy is None else {True: "within", False: "outside", None: "not decided"}[accuracy.within]
         limit = "" if accuracy is None or accuracy.most_mm is None else f"{accuracy.most_mm:g}"

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, text
 
-from service.core.records.entered import RunAbout
+from service.audit.filters import Result, RunSearch
+from service.audit.record.rows import RunBasics, runs
 from service.core.records.events import GatesEvaluated
-from service.store.records import SITE
 from service.store.runs import read_open_runs
 from service.store.store import Store
 
-Result = Literal["open", "completed", "aborted", "within", "outside", "released"]
-RESULTS: tuple[Result, ...] = get_args(Result)
 RESULT_WORDS: Mapping[Result, str] = {
     "open": "not ended",
     "completed": "completed",
@@ -27,26 +25,6 @@ RESULT_WORDS: Mapping[Result, str] = {
     "released": "released",
 }
 _ERROR = "mean_radial_error_mm"  # the measure of an evaluation that is shown as the accuracy of the run
-
-
-@dataclass(frozen=True, slots=True)
-class RunSearch:
-    """A search; an empty field matches every run."""
-
-    q: str = ""  # words that must all occur in what people wrote about the run
-    since: str = ""  # 2026-11-21, in UTC
-    until: str = ""
-    result: str = ""  # one of RESULTS
-
-    @property
-    def active(self) -> bool:
-        """True if any field is set."""
-        return any((self.q.strip(), self.since, self.until, self.result))
-
-    def query(self) -> dict[str, str]:
-        """Return the search as query parameters of a link."""
-        fields = {"q": self.q, "since": self.since, "until": self.until, "result": self.result}
-        return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +46,7 @@ class Accuracy:
 class FoundRun:
     """A run in a list."""
 
-    run_id: str
-    created_utc: str
-    simulated: bool
-    protocol: str
-    version: str
-    begun_by: str
-    about: RunAbout
+    basics: RunBasics
     notes: tuple[str, ...]
     status: Literal["open", "completed", "aborted"]
     released: bool
@@ -91,8 +63,8 @@ class FoundRun:
     @property
     def words(self) -> str:
         """The text that is searched, in lower case."""
-        said = (value for value in self.about.model_dump().values())
-        parts = (self.run_id, self.protocol, self.version, self.begun_by, *said, *self.notes)
+        run, said = self.basics, self.basics.about.model_dump().values()
+        parts = (run.run_id, run.protocol, run.version, run.operator, *said, *self.notes)
         return "\n".join(map(str, parts)).casefold()
 
 
@@ -104,24 +76,14 @@ def find_runs(store: Store, wanted: RunSearch) -> list[FoundRun]:
     return [
         run
         for run in every
-        if (not wanted.since or wanted.since <= run.created_utc[:10])
-        and (not wanted.until or run.created_utc[:10] <= wanted.until)
+        if (not wanted.since or wanted.since <= run.basics.created_utc[:10])
+        and (not wanted.until or run.basics.created_utc[:10] <= wanted.until)
         and (not wanted.result or run.has(wanted.result))
         and (not terms or all(term in run.words for term in terms))
     ]
 
 
 def _every(connection: Connection) -> list[FoundRun]:
-    roots = connection.execute(
-        text(
-            "SELECT r.run_id, r.created_utc, r.simulated, json_extract(e.payload, '$.protocol_id') AS protocol, "
-            "json_extract(e.payload, '$.protocol_version') AS version, "
-            "json_extract(e.payload, '$.operator') AS operator, json_extract(e.payload, '$.about') AS about "
-            "FROM runs AS r LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
-            "WHERE r.run_id <> :site ORDER BY r.created_utc DESC, r.run_id DESC"
-        ),
-        {"site": SITE},
-    ).all()
     still_open = read_open_runs(connection)
     ended = {run for run, _ in _of_kind(connection, "run_completed", "'x'")}
     released = {run for run, _ in _of_kind(connection, "run_released", "'x'")}
@@ -133,19 +95,13 @@ def _every(connection: Connection) -> list[FoundRun]:
     )
     return [
         FoundRun(
-            run_id=row.run_id,
-            created_utc=row.created_utc,
-            simulated=bool(row.simulated),
-            protocol=str(row.protocol or ""),
-            version=str(row.version or ""),
-            begun_by=str(row.operator or ""),
-            about=_about(row.about),
-            notes=tuple(notes.get(row.run_id, ())),
-            status="open" if row.run_id in still_open else "completed" if row.run_id in ended else "aborted",
-            released=row.run_id in released,
-            accuracy=_accuracy(judged.get(row.run_id, "")),
+            basics=run,
+            notes=tuple(notes.get(run.run_id, ())),
+            status="open" if run.run_id in still_open else "completed" if run.run_id in ended else "aborted",
+            released=run.run_id in released,
+            accuracy=_accuracy(judged.get(run.run_id, "")),
         )
-        for row in roots
+        for run in runs(connection)
     ]
 
 
@@ -161,13 +117,6 @@ def _of_kind(connection: Connection, kind: str, shown: str) -> Sequence[tuple[st
         {"kind": kind},
     )
     return [(str(row.run_id), str(row.shown)) for row in rows if row.shown]
-
-
-def _about(content: str | None) -> RunAbout:
-    try:
-        return RunAbout.model_validate_json(content) if content else RunAbout()
-    except ValidationError:  # the verification reports it
-        return RunAbout()
 
 
 def _accuracy(payload: str) -> Accuracy | None:

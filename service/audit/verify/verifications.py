@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -16,18 +17,10 @@ from pydantic import ValidationError
 from service.audit.background import ChildProcesses, ChildState, Progress, report
 from service.core.records.events import Record
 from service.store.durable_effects import Clock, utc_text
+from service.store.verification.chain_checks import Fault
 from service.store.verification.verify import AuditReport, verify
 
 LISTED = 500  # most faults listed in a result
-
-
-class VerifiedFault(Record):
-    """A fault that the verification found."""
-
-    run_id: str | None
-    seq: int | None
-    file: str
-    what: str
 
 
 class Outcome(Record):
@@ -39,7 +32,7 @@ class Outcome(Record):
     files: int
     bytes_hashed: int
     head_sha256: str  # hash of the last event that it covered
-    faults: tuple[VerifiedFault, ...]
+    faults: tuple[Fault, ...]
     fault_count: int
     notes: tuple[str, ...]
     duration_s: float
@@ -64,17 +57,19 @@ def keep_verification(data: Path, run_id: str, kept: Verification) -> None:
 def verification_of(report: AuditReport, run_id: str, *, by: str, at_utc: str, duration_s: float) -> Verification:
     """Return the result for one run of a report; the counts are those of all runs that were verified together."""
     faults = [fault for fault in report.faults if fault.run_id in (None, run_id)]
+    return Verification(at_utc=at_utc, by=by, **dict(_outcome(report, run_id, faults, duration_s)))
+
+
+def _outcome(report: AuditReport, run_id: str, faults: Sequence[Fault], duration_s: float) -> Outcome:
     together = [f"verified together with {len(report.runs) - 1} other runs"] if len(report.runs) > 1 else []
-    return Verification(
-        at_utc=at_utc,
-        by=by,
+    return Outcome(
         ok=not faults,
         events=report.events,
         artefacts=report.artefacts,
         files=report.files,
         bytes_hashed=report.bytes_hashed,
         head_sha256=report.heads.get(run_id, ""),
-        faults=tuple(VerifiedFault(run_id=f.run_id, seq=f.seq, file=f.file, what=f.what) for f in faults[:LISTED]),
+        faults=tuple(faults[:LISTED]),
         fault_count=len(faults),
         notes=(*together, *report.notes)[:LISTED],
         duration_s=duration_s,
@@ -128,19 +123,7 @@ def verification(data: Path, run_id: str, progress: Progress) -> Outcome:
     begun_s = time.monotonic()
     progress("reading the events", 0, 0)
     found = verify(data, run_id, progress)
-    faults = [VerifiedFault(run_id=f.run_id, seq=f.seq, file=f.file, what=f.what) for f in found.faults[:LISTED]]
-    return Outcome(
-        ok=found.ok,
-        events=found.events,
-        artefacts=found.artefacts,
-        files=found.files,
-        bytes_hashed=found.bytes_hashed,
-        head_sha256=found.heads.get(run_id, ""),
-        faults=tuple(faults),
-        fault_count=len(found.faults),
-        notes=tuple(found.notes[:LISTED]),
-        duration_s=time.monotonic() - begun_s,
-    )
+    return _outcome(found, run_id, found.faults, time.monotonic() - begun_s)
 
 
 def _told(progress: Progress) -> object:

@@ -76,7 +76,7 @@ def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
 
 def _is_seen(image: Grey, board: Board) -> bool:
     if board.pattern == "checkerboard":
-        seen = _seen(_small(image, _WIDTH))
+        seen = _find_grid(_small(image, _WIDTH))
         return seen is not None and sorted(seen[0]) == sorted((board.columns, board.rows))
     if board.pattern == "charuco":
         return _corners(_small(image, _CHARUCO_WIDTH), board) >= _FEWEST_CORNERS
@@ -95,7 +95,7 @@ def _small(image: Grey, width: int) -> Grey:
 # --- checkerboard -----------------------------------------------------------------------------------------
 
 
-def _seen(image: Grey) -> tuple[tuple[int, int], Array] | None:
+def _find_grid(image: Grey) -> tuple[tuple[int, int], Array] | None:
     """Return the columns and rows of the largest corner grid in the image, and the corners (rows, columns, 2)."""
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST, _LEAST), flags)
@@ -107,7 +107,7 @@ def _seen(image: Grey) -> tuple[tuple[int, int], Array] | None:
 
 def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
     small = _small(image, _WIDTH)
-    seen = _seen(small)
+    seen = _find_grid(small)
     wanted, given = sorted((board.columns, board.rows)), f"{board.columns} × {board.rows}"
     if (seen is None or sorted(seen[0]) == [_LEAST, _LEAST]) and _circles_in(small) >= _FEWEST_CIRCLES:
         return Diagnosis(
@@ -165,7 +165,7 @@ def _charuco(image: Grey, board: Board) -> Diagnosis | None:
             True,
         )
     if own < _FEWEST_MARKERS:
-        seen = _seen(_small(image, _WIDTH))
+        seen = _find_grid(_small(image, _WIDTH))
         if seen is not None and min(seen[0]) > _LEAST:
             return Diagnosis("the image shows a board without markers", "Give --pattern checkerboard", True)
         return None
@@ -317,7 +317,7 @@ def _circles(image: Grey, board: Board) -> Diagnosis | None:
             return Diagnosis(
                 "the circles lie in a symmetric grid", "Print an asymmetric one; symmetric ones are not read", True
             )
-    seen = _seen(small)
+    seen = _find_grid(small)
     if seen is not None and min(seen[0]) > _LEAST and _circles_in(small) < _FEWEST_CIRCLES:
         return Diagnosis("the image shows squares, not circles", "Give --pattern checkerboard", True)
     return None

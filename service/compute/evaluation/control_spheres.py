@@ -195,11 +195,11 @@ def _evaluated(
                 None if sigma_m is None else mm(sigma_m),
             )
         )
-    told = tuple(_told(row, off) for row in rows)
+    told = tuple(_with_finding(row, off) for row in rows)
     return ControlEvaluation(means, told, tuple(map(tuple, scene.outlines)), tuple(assignments), located)
 
 
-def _told(row: ControlSphere, off: dict[int, Array]) -> ControlSphere:
+def _with_finding(row: ControlSphere, off: dict[int, Array]) -> ControlSphere:
     """Return the row with its finding."""
     finding, name = "", f"control sphere {row.index}"
     if not row.measured:
@@ -406,12 +406,12 @@ class SeenSpheres:
             if best is None or score[k] > best[0]:
                 best = float(score[k]), part[k]
         assert best is not None
-        outlines = self._shown(mine, best[1])
+        outlines = self._images_showing(mine, best[1])
         if not outlines:
             return None
         # The place from all its outlines, and the outlines of that place.
         found = self._intersected(outlines, best[1])
-        return SeenPlace(found, self._shown(mine, found) or outlines)
+        return SeenPlace(found, self._images_showing(mine, found) or outlines)
 
     def _single(self, rays: _Rays) -> Array:
         """Return places by single outlines, each where it comes nearest to a control sphere, for few images."""
@@ -419,7 +419,7 @@ class SeenSpheres:
             return np.zeros((0, 3))
         return self._nearest(rays, self._spheres.control_m).reshape(-1, 3)
 
-    def _shown(self, rays: _Rays, place: Array) -> dict[int, int]:
+    def _images_showing(self, rays: _Rays, place: Array) -> dict[int, int]:
         meet, off = rays.meeting(place[None], self._spheres.radius_m)
         out: dict[int, int] = {}
         for k in np.argsort(off[0]):

@@ -94,7 +94,7 @@ class BlockedSamples:
         if places is None or not _overlap(places, runs):
             blocks = self.blocks()
             while some := list(islice(blocks, _TOGETHER)):
-                points_m, origin = _joined(some)
+                points_m, origin = _take_together(some)
                 yield Samples(points_m, origin, None)
             return
         order = z_order(places)
@@ -109,7 +109,7 @@ class BlockedSamples:
             region[at] = (first[of] + at - (self._upto[of] - count[of])) // (_TOGETHER * _BLOCK)
         for number in range(int(region.max()) + 1):
             chosen = [np.flatnonzero(region[begin : begin + _BLOCK] == number) for begin in range(0, self.n, _BLOCK)]
-            points_m, origin = _joined(list(self.blocks(chosen)))
+            points_m, origin = _take_together(list(self.blocks(chosen)))
             near = np.argsort(first[origin])
             yield Samples(points_m[near], origin[near], None)
 
@@ -122,7 +122,7 @@ def _overlap(places: Array, runs: int) -> bool:
     return float(np.sum(boxes)) > 2 * float(np.prod(whole + thickness))
 
 
-def _joined(some: list[Samples]) -> tuple[Array, IntArray]:
+def _take_together(some: list[Samples]) -> tuple[Array, IntArray]:
     """Return points and origins of several blocks, and take them off the list so that they are not there twice."""
     points_m = np.concatenate([block.points_m for block in some])
     origin = np.concatenate([block.origin for block in some])

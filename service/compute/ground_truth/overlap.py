@@ -136,7 +136,7 @@ def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | N
         up: (3,) direction away from the table.
     """
     bounds = limits or WoundLimits()
-    lacking = _closed(ct.vertices_m, ~covered, bounds.closing_m)
+    lacking = _close_mask(ct.vertices_m, ~covered, bounds.closing_m)
     labels = components(ct, lacking)
     wound = np.zeros(len(lacking), dtype=np.bool_)
     if not lacking.any():
@@ -219,7 +219,7 @@ def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
     return distance
 
 
-def _closed(points: Array, chosen: Mask, radius: float) -> Mask:
+def _close_mask(points: Array, chosen: Mask, radius: float) -> Mask:
     """Grow and shrink a mask by a radius, so that gaps and islands between chosen points are chosen, too."""
     grown = distance_to(points, chosen, radius) <= radius
     return chosen | (distance_to(points, ~grown, radius) > radius)

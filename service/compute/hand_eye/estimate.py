@@ -216,7 +216,7 @@ def calibrate_hand_eye(
             images (`check_setup` names the reading that does), more than a third of the images disagree with the
             robot, or the board's size differs from the given one by more than its tolerance and the uncertainty.
     """
-    data, poses = _measured(views), views.poses
+    data, poses = _as_arrays(views), views.poses
     if setup == "eye-to-hand":
         data = dataclasses.replace(data, hands=inverted(data.hands), joints_rad=None, arm=None)
         poses = None if poses is None else poses.inverted()
@@ -409,7 +409,7 @@ def _quality(
     }
 
 
-def _measured(views: HandEyeViews) -> HandEyeMeasurements:
+def _as_arrays(views: HandEyeViews) -> HandEyeMeasurements:
     """Return the views as arrays whose shapes agree."""
     corners = views.corners
     hands = np.asarray(views.T_base_flange, dtype=np.float64)

@@ -202,7 +202,7 @@ def linearise(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[
     return out
 
 
-def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
+def _project(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
     """Return points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose, (O, 3, 3) by the point."""
     R, t = cameras[:, :3, :3], cameras[:, :3, 3]
     v = points - t
@@ -213,7 +213,7 @@ def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
 
 def _track_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Rows:
     tracks = data.tracks
-    c, d_pose, d_point = _seen(state.cameras[tracks.image], state.points[tracks.point])
+    c, d_pose, d_point = _project(state.cameras[tracks.image], state.points[tracks.point])
     camera = state.camera
     f = np.array([camera.fx, camera.fy]) / sigmas.track_px
     measured = camera.normalise(tracks.pixels)
@@ -234,7 +234,7 @@ def _sphere_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Ro
     assert s is not None
     point = s.marker + len(data.tracks.points)
     light = data.light_unit_m * state.common[3:]
-    c, d_pose, d_point = _seen(state.cameras[s.image], state.points[point] + light)
+    c, d_pose, d_point = _project(state.cameras[s.image], state.points[point] + light)
     cones, e, lens = s.cones, s.cones.directions, None
     if data.lens_covariance is not None:
         assert data.calibrated is not None

@@ -40,14 +40,14 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: the file is missing, truncated or not a decodable image.
     """
-    data = _checked(path)
+    data = _read_content(path)
     if data.startswith(JPEG_BEGINS):
         return picture_size(data, str(path))
     height, width = _decoded(data, path, cv2.IMREAD_GRAYSCALE).shape
     return width, height
 
 
-def _checked(path: Path) -> bytes:
+def _read_content(path: Path) -> bytes:
     """Return the content of an image file, which decides its kind, not its name."""
     try:
         data = path.read_bytes()
@@ -89,7 +89,7 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _decode(path: Path, how: int) -> NDArray[np.uint8]:
-    return _decoded(_checked(path), path, how)
+    return _decoded(_read_content(path), path, how)
 
 
 def _decoded(data: bytes, path: Path, how: int) -> NDArray[np.uint8]:

@@ -125,7 +125,7 @@ def check_layout(
         DataError: the centres are not (N, 3), or not finite.
         ComputeError: fewer than four spheres, or two at the same place.
     """
-    centres = _checked(centres_m, radius_m)
+    centres = _require_centres(centres_m, radius_m)
     joint = _joint(covariance, len(centres))
     matches = confusions(centres, beyond_m=max(2 * required_margin_m, _REACH_M))
     order = np.argsort(matches.misfit, kind="stable")
@@ -152,7 +152,7 @@ def check_layout(
     return replace(report, problems=_problems(report, required_margin_m))
 
 
-def _checked(centres_m: Array, radius_m: float) -> Array:
+def _require_centres(centres_m: Array, radius_m: float) -> Array:
     """Return the centres as numbers (N, 3). Raises DataError or ComputeError, as `check_layout` says."""
     centres = np.asarray(centres_m, dtype=np.float64)
     if centres.ndim != 2 or centres.shape[1] != 3 or not np.isfinite(centres).all():

@@ -81,19 +81,23 @@ def suggest_moves(
         trials: list[tuple[float, int, Array]] = []
         for sphere in _involved(placed, fixed, required_margin_m):
             for by in _directions(up):
-                trial = _moved(placed, sphere, by)
+                trial = _shift(placed, sphere, by)
                 if _fits(placed, trial, sphere, up, radius_m):
                     trials.append((_quick_rating(trial, required_margin_m), sphere, by))
         trials.sort(key=lambda entry: -entry[0])
         rated = [
-            (min(_rating(at, required_margin_m) for at in _around(_moved(placed, sphere, by), sphere)), sphere, by)
+            (
+                min(_rating(at, required_margin_m) for at in _around(_shift(placed, sphere, by), sphere)),
+                sphere,
+                by,
+            )
             for _, sphere, by in trials[:_LOOKED_AT]
         ]
         best = max(rated, key=lambda entry: entry[0], default=None)
         if best is None or best[0] <= now + 1e-3:
             break
         now, sphere, by = best
-        placed = _moved(placed, sphere, by)
+        placed = _shift(placed, sphere, by)
         chosen.append(Move(sphere, by, check_layout(placed, radius_m=radius_m).margin_m))
     if not chosen:
         raise ComputeError(
@@ -102,7 +106,7 @@ def suggest_moves(
     return tuple(chosen)
 
 
-def _moved(centres: Array, sphere: int, by: Array) -> Array:
+def _shift(centres: Array, sphere: int, by: Array) -> Array:
     moved = centres.copy()
     moved[sphere] += by
     return moved
@@ -131,7 +135,7 @@ def _rating(centres: Array, required: float) -> float:
 def _around(trial: Array, sphere: int) -> list[Array]:
     """Return the layout itself and variants with the sphere slightly displaced."""
     offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * _PLACING_M
-    return [_moved(trial, sphere, offset) for offset in offsets]
+    return [_shift(trial, sphere, offset) for offset in offsets]
 
 
 def _involved(centres: Array, fixed: Collection[int], required: float) -> list[int]:

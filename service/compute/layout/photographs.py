@@ -84,7 +84,7 @@ def layout_from_photographs(
     group = _Group([order[0]], [np.arange(len(first.cones))], [np.eye(4)])
     found = _adjusted(photographs, group, places_by_size(first.cones, radius_m), radius_m, prior)
     for k in order[1:]:
-        group, found = _joined(photographs, group, found, k, radius_m, prior)
+        group, found = _add_photograph(photographs, group, found, k, radius_m, prior)
     if expected is not None and len(found.centres_m) > expected:
         group, found = _reduced(photographs, group, found, expected, radius_m, prior)
     spheres: list[IntArray] = [np.empty(0, dtype=np.int64)] * len(photographs)
@@ -116,7 +116,7 @@ def _adjusted(
     return adjust(chosen, spheres, centres, group.poses, radius_m, prior)
 
 
-def _joined(
+def _add_photograph(
     photographs: Sequence[SpherePhotograph],
     group: _Group,
     found: AdjustedLayout,

@@ -279,10 +279,10 @@ def _sphere_masks(
         pictures = [normalised(np.repeat(patch[:, :, c, None], 3, axis=2), size) for patch in some for c in range(3)]
         logits = networks.masks(np.concatenate(pictures))
         for k in range(len(some)):
-            yield in_the_middle(_joined(logits[3 * k : 3 * k + 3]))
+            yield in_the_middle(_union_of_masks(logits[3 * k : 3 * k + 3]))
 
 
-def _joined(logits: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _union_of_masks(logits: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return pixels that at least one of three channels' logits (3, m, m) calls the object, at the masks' size."""
     size = (MASK_SIDE, MASK_SIDE)
     channels = [cv2.resize(channel, size, interpolation=cv2.INTER_LINEAR) > 0 for channel in logits]

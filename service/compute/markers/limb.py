@@ -156,7 +156,7 @@ class _BeforeBlur:
     share: Array32
 
 
-def _shown(p: Array, blur: Array, model: LimbModel) -> _BeforeBlur:
+def _predict(p: Array, blur: Array, model: LimbModel) -> _BeforeBlur:
     """Predict grey values: the light of sphere and surroundings, blurred by lens and pixel, then gamma-encoded."""
     s = blur.astype(np.float32)[:, None, None]
     R = model.radius.astype(np.float32)[:, None, None]
@@ -216,7 +216,7 @@ def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32
 
 def evaluate(p: Array, blur: Array, chroma_blur: Array, model: LimbModel) -> tuple[Array32, Array32]:
     """Return the model's Jacobian and, last, residual (G, 13, 3, K, J) in Y, Cb, Cr; the sphere's share (G, K, J)."""
-    shown = _shown(p, blur, model)
+    shown = _predict(p, blur, model)
     mixed, S, sharp = shown.mixed, shown.share, model.sharp
     G, K, wider = S.shape
     J = len(model.t)
@@ -309,7 +309,7 @@ def fit_limb(
         delta, change, variance = _gauss_newton(normal, p, shading.priors(), good)
         blur = np.clip(blur + change[:, 0], 0.3, 5.0)
         chroma_blur = np.clip(chroma_blur + change[:, 1], 0.3, 2.5)
-        p = _moved(p, delta, reach)
+        p = _step(p, delta, reach)
         if 1 <= it < iterations - 1:
             shading = shading.renewed(p, good)
     sigma = np.sqrt(variance * np.maximum(misfit, 0.3 * typical))
@@ -361,7 +361,7 @@ def _products(rows: Array32, share: Array32, inside: Array, outside: Array) -> A
     return np.asarray(rows @ rows.transpose(0, 1, 3, 2), dtype=np.float64)
 
 
-def _moved(p: Array, delta: Array, reach: float) -> Array:
+def _step(p: Array, delta: Array, reach: float) -> Array:
     """Return the profiles' parameters after a step, within their limits."""
     delta[..., OFFSET] = np.clip(delta[..., OFFSET], -0.7, 0.7)
     p = p + delta

@@ -266,7 +266,7 @@ def _measure(
     covariance = _covariances(where.azimuth_rad, fit)
     contrast = masked_median(limb.contrast, fit.used)
     return [
-        _measured(i, cone, limb, fit, (float(angle[i]), covariance[i], float(contrast[i])), unit)
+        _subpixel_cone(i, cone, limb, fit, (float(angle[i]), covariance[i], float(contrast[i])), unit)
         for i, cone in enumerate(cones)
     ]
 
@@ -281,7 +281,7 @@ def _offsets(radius: Array, blurs: Sequence[float], step: float) -> Array:
     return np.asarray(np.arange(-round(inner / step), round(outer / step) + 1) * step, dtype=np.float64)
 
 
-def _measured(
+def _subpixel_cone(
     i: int, cone: Cone, limb: LimbFit, fit: _ConeFits, worth: tuple[float, Array, float], unit: int
 ) -> _SubpixelCone | None:
     """Return outline `i`, or None if unreliable; `worth`: radians per unit, covariance in squared units, contrast."""

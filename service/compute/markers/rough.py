@@ -219,7 +219,7 @@ def examine(
         coverage = float(votes.mean())
         if coverage < 0.8 * options.min_coverage * 0.8:
             return None
-    return _judged(coarse, edge_map, camera, cone, votes, options)
+    return _judge(coarse, edge_map, camera, cone, votes, options)
 
 
 def _fitted(
@@ -280,11 +280,11 @@ def outermost(
     part = inner.half_angle_rad / cone.half_angle_rad
     if share(coarse, camera, cone, colour, (part, 0.95)) < _LEAST_RING:
         return rough
-    outer = _judged(coarse, edge_map, camera, cone, votes, options)
+    outer = _judge(coarse, edge_map, camera, cone, votes, options)
     return outer if outer is not None and outer.plain else rough
 
 
-def _judged(
+def _judge(
     coarse: NDArray[np.uint8],
     edge_map: NDArray[np.bool_],
     camera: CameraModel,

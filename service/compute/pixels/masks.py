@@ -123,7 +123,7 @@ def _frustum(rays: PixelRays, camera: CameraModel) -> Array:
 def _fill(mask: NDArray[np.uint8], camera: CameraModel, frustum: Array, outline: Array) -> None:
     """Draw a convex outline of rays (N, 3), cut to the frustum."""
     for plane in frustum:
-        outline = _cut(outline, plane)
+        outline = _clip(outline, plane)
         if len(outline) < 3:
             return
     outline = outline / outline[:, 2:]
@@ -134,7 +134,7 @@ def _fill(mask: NDArray[np.uint8], camera: CameraModel, frustum: Array, outline:
     cv2.fillPoly(mask, [pixels], 1, shift=_SHIFT)
 
 
-def _cut(polygon: Array, plane: Array) -> Array:
+def _clip(polygon: Array, plane: Array) -> Array:
     """Return the part of a convex polygon of rays (N, 3) with plane · ray >= 0 (Sutherland and Hodgman, 1974)."""
     kept: list[Array] = []
     height = polygon @ plane

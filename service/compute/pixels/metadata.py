@@ -64,7 +64,7 @@ def with_metadata_of(original: bytes, resampled: bytes, *, personal: bool, where
         DataError: one of them is not a picture.
     """
     try:
-        source = _opened(original, where).exifData()
+        source = _open(original, where).exifData()
     except _BrokenMetadataError:
         source = exiv2.ExifData()
     if not personal:
@@ -112,7 +112,7 @@ def _changed(picture: bytes, change: Callable[[Any], object], where: str) -> byt
 
 
 def _written(picture: bytes, change: Callable[[Any], object], where: str) -> bytes:
-    image = _opened(picture, where)
+    image = _open(picture, where)
     change(image)
     try:
         image.writeMetadata()  # reads the file once more, with other demands
@@ -121,7 +121,7 @@ def _written(picture: bytes, change: Callable[[Any], object], where: str) -> byt
     return bytes(image.io().mmap())
 
 
-def _opened(picture: bytes, where: str) -> Any:
+def _open(picture: bytes, where: str) -> Any:
     try:
         image = exiv2.ImageFactory.open(picture)
         image.readMetadata()

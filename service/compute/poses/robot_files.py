@@ -226,7 +226,7 @@ def _columns(first: Sequence[str], path: Path, line: int) -> _Columns:
         for turn, form, unit in _ROTATIONS:
             if set(place) | set(turn) <= set(known):
                 numbers = tuple(known.index(cell) for cell in (*place, *turn))
-                return _Columns(True, len(first), name, numbers, form, _stated(first[numbers[0]]) or unit)
+                return _Columns(True, len(first), name, numbers, form, _unit_in_heading(first[numbers[0]]) or unit)
     raise DataError(
         f"the first line is {','.join(first)!r}",
         where=f"{path}:{line}",
@@ -262,7 +262,7 @@ def _bare(cell: str) -> str:
     return re.sub(r"([\s_]*[\[(].*|_(mm|cm|m|in|deg|rad))$", "", cell.strip().lower())
 
 
-def _stated(cell: str) -> LengthUnit | None:
+def _unit_in_heading(cell: str) -> LengthUnit | None:
     unit = re.search(r"[\s_\[(](mm|cm|m|in)[\])]?$", cell.strip().lower())
     units: tuple[LengthUnit, ...] = get_args(LengthUnit)
     return next((known for known in units if unit is not None and unit[1] == known), None)

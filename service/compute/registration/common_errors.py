@@ -123,7 +123,7 @@ def beyond_model(
     significant: dict[CommonErrorName, CommonError] = {e.name: e for e in errors if e.significant}
     component = np.zeros((6, 6))
     if free is not None and significant:
-        ways = _moved(held, free)
+        ways = _perturbations(held, free)
         component += sum(np.outer(moved, moved) for moved in ways) / len(ways)
     light_px = _light_px(significant.get("growth_px"), blur_px, common)
     light_m = held.solution.problem.light_unit_m * float(np.sqrt(max(0.0, light_px**2 - common.light_px**2)))
@@ -207,7 +207,7 @@ def _errors(
     return (*out, CommonError("scale", free.scale - 1, free.scale * of_scale, _EXPECTED_SCALE))
 
 
-def _moved(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, ...]:
+def _perturbations(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, ...]:
     """Return (6,) perturbations of T_world_scan, against the cameras, from the one registration to the other.
 
     Two, if their scales differ: the one holds if the positions are wrong, the other if the list is.

@@ -218,7 +218,7 @@ def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
 
     Raises ComputeError: there is no view.
     """
-    return _joined({name: (v.T_scan_camera, v.noise, v.noise + v.common) for name, v in views.items()})
+    return _mean_pose({name: (v.T_scan_camera, v.noise, v.noise + v.common) for name, v in views.items()})
 
 
 def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]) -> FurtherPose:
@@ -239,10 +239,10 @@ def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]
         noise = of_product(T_first_scan, view.T_scan_camera, nothing, view.noise)
         common = of_product(T_first_scan, view.T_scan_camera, known, view.common)
         found[name] = (T_first_scan @ view.T_scan_camera, noise, common)
-    return _joined(found)
+    return _mean_pose(found)
 
 
-def _joined(views: Mapping[str, tuple[Transform, Array, Array]]) -> FurtherPose:
+def _mean_pose(views: Mapping[str, tuple[Transform, Array, Array]]) -> FurtherPose:
     if not views:
         raise ComputeError("no image shows four spheres that can be told apart")
     poses, noise, common = (np.array(part) for part in zip(*views.values(), strict=True))

@@ -131,7 +131,7 @@ def image_hypotheses(
     if len(outlines) < 4 or len(centres_scan_m) < 4:
         return []
     seen = sightings(outlines, radius_m, camera)
-    return list(_answered(_Question(seen, np.asarray(centres_scan_m), radius_m, camera.fx)))
+    return list(_answer(_Question(seen, np.asarray(centres_scan_m), radius_m, camera.fx)))
 
 
 class _Question:
@@ -150,7 +150,7 @@ class _Question:
 
 
 @lru_cache(maxsize=_MOST_KEPT)
-def _answered(question: _Question) -> tuple[Hypothesis, ...]:
+def _answer(question: _Question) -> tuple[Hypothesis, ...]:
     seen, centres, radius_m = question.seen, question.centres, question.radius_m
     model, image = _triples(seen, min(len(seen.cones), _MOST_DETECTIONS), centres)
     if len(model) == 0:

@@ -68,7 +68,7 @@ def completed(known: Surface, views: Sequence[StereoView], footprint_m: float) -
         even = averaged(Surface(vertices, guess.faces).vertex_normals, edges, _EVEN)
         normals = even[part.vertices] / np.maximum(np.linalg.norm(even[part.vertices], axis=1, keepdims=True), 1e-9)
         moves = np.arange(-reach, reach + step / 2, step) * footprint_m
-        moved, found = _moved(photographs, vertices[part.vertices], normals, part, moves, spacing * footprint_m)
+        moved, found = _best_moves(photographs, vertices[part.vertices], normals, part, moves, spacing * footprint_m)
         places = vertices[part.vertices] + moved[:, None] * normals
         held = ((found - _NO_HOLD) / (_FULL_HOLD - _NO_HOLD)).clip(0, 1) ** 2
         even_m, slip_m = _SMOOTH_PX * footprint_m, _SLIP_PX * footprint_m
@@ -94,7 +94,7 @@ def _opening(
     return _Opening(vertices, compact[edges[taken[edges].all(axis=1)]], ~is_open[vertices])
 
 
-def _moved(
+def _best_moves(
     photographs: Sequence[Photograph],
     points_m: Array,
     normals: Array,

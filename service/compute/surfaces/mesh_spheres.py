@@ -121,7 +121,7 @@ def locate_spheres(
             found and the near misses with reasons.
     """
     bounds = limits or SphereLimits()
-    vertices, triangles = _checked(vertices_m, faces, normals)
+    vertices, triangles = _require_mesh(vertices_m, faces, normals)
     patches = surfels(vertices, triangles, normals, _SURFEL * radius_m)
     if len(patches.area) == 0:
         raise ComputeError("found 0 spheres: the mesh has no surface", remedy="Check the mesh's unit")
@@ -137,7 +137,7 @@ def locate_spheres(
     return tuple(sorted(spheres, key=lambda s: -s.coverage))
 
 
-def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | None) -> tuple[Array, IntArray]:
+def _require_mesh(vertices_m: Array, faces: NDArray[np.integer], normals: Array | None) -> tuple[Array, IntArray]:
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
     triangles = cast(
         "IntArray", np.asarray(faces)

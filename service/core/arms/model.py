@@ -169,9 +169,16 @@ GROUP = "orthocapture.arms"
 
 @cache
 def known_arms() -> tuple[ArmModel, ...]:
-    """Return all arms, ordered by name of their entry points."""
-    found: list[ArmModel] = []
+    """Return all arms, by name of their row: those of the two tables, and those of other packages' entry points.
+
+    An installation from when each arm of ours had a module still lists these; the tables stand for them.
+    """
+    from service.core.arms import kuka, universal_robots  # noqa: PLC0415 - their rows are models
+
+    found: dict[str, ArmModel] = {**kuka.ARMS, **universal_robots.ARMS}
     for point in plug_ins(GROUP):
+        if point.module.startswith(f"{__package__}."):
+            continue
         arm: object = point.load()
         if not isinstance(arm, ArmModel):
             raise ConfigurationError(
@@ -179,8 +186,8 @@ def known_arms() -> tuple[ArmModel, ...]:
                 where=point.value,
                 remedy="Let it name an ArmModel, or remove the package that has it",
             )
-        found.append(arm)
-    return tuple(found)
+        found[point.name] = arm
+    return tuple(found[name] for name in sorted(found))
 
 
 def arm_model(name: str) -> ArmModel:

@@ -32,6 +32,11 @@ class ArtefactRef(Record):
     size_bytes: int
     original_name: str
 
+    @property
+    def is_picture(self) -> bool:
+        """True if a browser can show the file."""
+        return self.media_type in ("image/jpeg", "image/png")
+
 
 _AGREE_S = 5.0  # by which the two clocks may differ over any time: UTC is stepped by less than this unnoticed
 _AGREE_SHARE = 0.001  # and of the time that has passed: UTC is slewed by up to 500 ppm

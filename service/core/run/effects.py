@@ -24,7 +24,6 @@ from service.core.records.events import (
     JobFailed,
     JobFinished,
     LeaveLapsed,
-    RecordCorrected,
     RecordedView,
     RegionDrawn,
     RobotSeen,
@@ -48,7 +47,6 @@ from service.core.run.state import (
     ENDINGS,
     NO_ARM,
     ArmConnection,
-    Correction,
     DrawnRegion,
     FailedTries,
     Failure,
@@ -462,12 +460,6 @@ def control_taken(protocol: Protocol, state: RunState, event: Event, p: ControlT
     """Another screen controls the run, or none."""
     controller = event.actor if p.screen else ""
     return replace(state, controller=controller, people=state.people | {event.actor})
-
-
-def record_corrected(protocol: Protocol, state: RunState, event: Event, p: RecordCorrected) -> RunState:
-    """List a correction of the record."""
-    correction = Correction(event.seq, p.of_seq, p.field, p.old, p.new, p.reason, event.actor)
-    return replace(state, corrections=(*state.corrections, correction))
 
 
 def run_released(protocol: Protocol, state: RunState, event: Event, p: RunReleased) -> RunState:

@@ -59,7 +59,6 @@ from service.core.run.effects import (
     job_ended,
     job_enqueued,
     leave_lapsed,
-    record_corrected,
     region_drawn,
     robot_seen,
     run_aborted,
@@ -246,7 +245,7 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     RobotSeen: robot_seen,
     NoteTaken: _no_effect,
     ControlTaken: control_taken,
-    RecordCorrected: record_corrected,
+    RecordCorrected: _no_effect,  # the original stands; readers see the correction beside it
     RunReleased: run_released,
     EvidenceExported: _no_effect,
     OperatorAction: apply_action,

@@ -294,19 +294,6 @@ class Lapse:
 
 
 @dataclass(frozen=True, slots=True)
-class Correction:
-    """A recorded RecordCorrected with its sequence number and the person who made it."""
-
-    seq: int
-    of_seq: int
-    field: str
-    old: Any
-    new: Any
-    reason: str
-    actor: str
-
-
-@dataclass(frozen=True, slots=True)
 class DrawnRegion:
     """A region of the ground truth that a person drew."""
 
@@ -346,7 +333,6 @@ class RunState:
     last_redo_seq: int = 0
     people: frozenset[str] = frozenset()  # those who took part: started it, controlled it, acted on it
     controller: str = ""  # person whose screen controls the run; "" for nobody
-    corrections: tuple[Correction, ...] = ()
     drawn: tuple[DrawnRegion, ...] = ()  # regions of the ground truth that people drew, the latest last
     ended_utc: str = ""  # the time of run_completed or run_aborted
     completed_sha256: str = ""  # the hash of the run_completed event: what a release binds

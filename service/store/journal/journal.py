@@ -141,7 +141,7 @@ class Journal:
         tail = self._known
         assert tail is not None, "a journal is begun before it is continued"
         number = tail.number + 1
-        raw = line_bytes(LineFields(number, held, tail.sha256), rows)
+        raw = line_bytes(LineFields(number, held, tail.sha256, continued=False, earlier_events=0), rows)
         with _locked(self.path):
             try:
                 self._files.append(self.path, tail.end, raw)

@@ -36,27 +36,36 @@ class RowImage:
 
 
 @dataclass(frozen=True, slots=True)
-class JournalLine:
-    """One line of the journal.
+class LineFields:
+    """The fields of a line besides its rows.
 
     Attributes:
         number: the line's number from 1, as it says; 0 if it cannot be read.
         after: number of the line that the database held when this one was written; 0 for none.
         previous_sha256: hash of the line before it, as it says.
-        rows: the rows that its transaction changed.
         continued: true if the next line belongs to the same transaction.
         earlier_events: number of events that were recorded before there was a journal; only in its first line.
-        sha256: hash of its bytes.
-        end: the offset in the file after it.
-        problem: the reason why it is not as it was written, as far as it shows by itself; "" if it does not.
     """
 
     number: int
     after: int
     previous_sha256: str
-    rows: tuple[RowImage, ...]
     continued: bool
     earlier_events: int
+
+
+@dataclass(frozen=True, slots=True)
+class JournalLine(LineFields):
+    """One line of the journal.
+
+    Attributes:
+        rows: the rows that its transaction changed.
+        sha256: hash of its bytes.
+        end: the offset in the file after it.
+        problem: the reason why it is not as it was written, as far as it shows by itself; "" if it does not.
+    """
+
+    rows: tuple[RowImage, ...]
     sha256: str
     end: int
     problem: str = ""
@@ -77,17 +86,6 @@ class Ending:
 
     mark: Mark | None
     torn_bytes: int
-
-
-@dataclass(frozen=True, slots=True)
-class LineFields:
-    """The fields of a line besides its rows."""
-
-    number: int
-    after: int
-    previous_sha256: str
-    continued: bool = False
-    earlier_events: int = 0
 
 
 def line_bytes(fields: LineFields, rows: Sequence[RowImage]) -> bytes:
@@ -125,10 +123,10 @@ def parse_line(raw: bytes, end: int) -> JournalLine:
         rows = tuple(_row(item) for item in data["rows"])
         written = line_bytes(fields, rows)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return JournalLine(0, 0, "", (), False, 0, sha256, end, UNREADABLE)
+        return JournalLine(0, 0, "", False, 0, (), sha256, end, UNREADABLE)
     problem = "" if raw == written else "it is not as it was written: its text was altered"
-    said = fields.number, fields.after, fields.previous_sha256
-    return JournalLine(*said, rows, fields.continued, fields.earlier_events, sha256, end, problem)
+    said = fields.number, fields.after, fields.previous_sha256, fields.continued, fields.earlier_events
+    return JournalLine(*said, rows, sha256, end, problem)
 
 
 def _row(item: Any) -> RowImage:

@@ -39,28 +39,27 @@ def _events(
     template: str,
     **context: Any,
 ) -> Response:
-    wanted = query.wanted()
     digest = here.digests.get(chain) if chain != SITE else None
     with here.site.store.database.reading() as connection:
         facets = digest.facets if digest is not None and not isinstance(digest, PartialProgress) else search.Facets()
         last, _ = rows.head(connection, chain)
         if chain == SITE:
             facets.add(connection, SITE, 0, last)
-        counted = facets.matching(wanted) if facets.kinds else None
-        page = search.events_page(connection, chain, wanted, after=query.after, before=query.before, counted=counted)
+        counted = facets.matching(query) if facets.kinds else None
+        page = search.events_page(connection, chain, query, after=query.after, before=query.before, counted=counted)
         devices = search.artefact_facets(connection, chain)["device"]
     address = request.url.path
     return render(
         request,
         template,
         events=page,
-        wanted=wanted,
+        wanted=query,
         facets=facets,
         devices=sorted({*facets.devices, *devices}),
         progress=digest if isinstance(digest, PartialProgress) else None,
         last=last,
-        earlier=link(address, {**wanted.query(), "before": page.before}) if page.before else "",
-        later=link(address, {**wanted.query(), "after": page.after}) if page.after else "",
+        earlier=link(address, {**query.query(), "before": page.before}) if page.before else "",
+        later=link(address, {**query.query(), "after": page.after}) if page.after else "",
         **context,
     )
 
@@ -121,18 +120,17 @@ def artefacts_page(
 ) -> Response:
     """Show every file of a run."""
     frame = audit_frame(audit, run_id, "/artefacts")
-    wanted = query.wanted()
     with audit.site.store.database.reading() as connection:
-        found = search.artefacts_page(connection, run_id, wanted, page=query.page)
+        found = search.artefacts_page(connection, run_id, query, page=query.page)
         facets = search.artefact_facets(connection, run_id)
     return render(
         request,
         "audit/artefacts.html.j2",
         audit=frame,
         found=found,
-        wanted=wanted,
+        wanted=query,
         facets=facets,
-        href=lambda number: link(f"{frame.base}/artefacts", {**wanted.query(), "page": number}),
+        href=lambda number: link(f"{frame.base}/artefacts", {**query.query(), "page": number}),
     )
 
 

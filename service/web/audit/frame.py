@@ -9,15 +9,14 @@ from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import Depends, FastAPI, Request
-from pydantic import AfterValidator, BaseModel, BeforeValidator
 
 from service.audit.background import ChildState, IncrementalResults
+from service.audit.filters import ArtefactFilter, EventFilter, RunFilter
 from service.audit.overview.digest import Digest, digests
-from service.audit.overview.first_page import RunFilter, verified
+from service.audit.overview.first_page import verified
 from service.audit.provenance import Graph, graphs
 from service.audit.record import rows
 from service.audit.record.rows import RunBasics
-from service.audit.record.search import ArtefactFilter, EventFilter
 from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
 from service.store.records import UnknownRunError
@@ -109,63 +108,20 @@ def link(address: str, query: Mapping[str, str | int | None]) -> str:
     return f"{address}?{urlencode(fields)}" if fields else address
 
 
-LONGEST = 200  # characters of a filter; more is cut
+class RunQuery(RunFilter):
+    """A page of the list of runs."""
 
-
-def cut(text: str) -> str:
-    """Return the text of a filter, without outer blanks and cut to the longest length."""
-    return text[:LONGEST].replace("\0", "")
-
-
-Text = Annotated[str, AfterValidator(cut)]
-Ticked = Annotated[bool, BeforeValidator(bool)]  # any text ticks the box
-
-
-class RunQuery(BaseModel):
-    """Filters of the list of runs."""
-
-    since: Text = ""
-    until: Text = ""
-    protocol: Text = ""
-    person: Text = ""
-    status: Text = ""
-    simulated: Text = ""
-    deviations: Ticked = False
-    unverified: Ticked = False
-    q: Text = ""
     page: int = 1
 
-    def wanted(self) -> RunFilter:
-        """Return the filter of runs that these fields describe."""
-        return RunFilter(**self.model_dump(exclude={"page"}))
 
+class EventQuery(EventFilter):
+    """A page of a list of events, which begins after one event or ends before one."""
 
-class EventQuery(BaseModel):
-    """Filters of a list of events, which begins after one event or ends before one."""
-
-    step: Text = ""
-    device: Text = ""
-    person: Text = ""
-    kind: Text = ""
-    q: Text = ""
     after: int = 0
     before: int = 0
 
-    def wanted(self) -> EventFilter:
-        """Return the filter of events that these fields describe."""
-        return EventFilter(self.step, self.device, self.person, self.kind, self.q)
 
+class ArtefactQuery(ArtefactFilter):
+    """A page of the list of files."""
 
-class ArtefactQuery(BaseModel):
-    """Filters of the list of files."""
-
-    kind: Text = ""
-    step: Text = ""
-    device: Text = ""
-    viewpoint: Text = ""
-    q: Text = ""
     page: int = 1
-
-    def wanted(self) -> ArtefactFilter:
-        """Return the filter of files that these fields describe."""
-        return ArtefactFilter(self.kind, self.step, self.device, self.viewpoint, self.q)

@@ -12,6 +12,7 @@ from fastapi.responses import HTMLResponse, Response
 from sqlalchemy import text
 
 from service.audit.background import PartialProgress
+from service.audit.filters import RunSearch
 from service.audit.overview import findings, first_page
 from service.audit.overview.devices import bodies_of_run, opened_devices
 from service.audit.overview.digest import Digest, failed_exposures_of, shots_of, together
@@ -20,7 +21,7 @@ from service.audit.overview.signatures import RecordedSignature
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import rows
 from service.audit.record.rows import EventRow
-from service.audit.runs.search import RunSearch, find_runs
+from service.audit.runs.search import find_runs
 from service.core.errors import OrthocaptureError
 from service.core.recorded_devices import CameraBodies, RecordedIdentity
 from service.people.approvals import Approval, approvals, difference
@@ -236,12 +237,11 @@ _RUNS_A_PAGE = 25
 @router.get("/audit", name="audit", dependencies=_READ, response_class=HTMLResponse)
 def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, Query()]) -> Response:
     """Show the runs, newest first."""
-    wanted = query.wanted()
     with audit.site.store.database.reading() as connection:
         every = rows.runs(connection)
-    said = {run.run_id for run in find_runs(audit.site.store, RunSearch(q=wanted.q))}
+    said = {run.basics.run_id for run in find_runs(audit.site.store, RunSearch(q=query.q))}
     listed = [_listed(audit, basics) for basics in every]
-    found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, wanted)]
+    found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, query)]
     pages = max(1, -(-len(found) // _RUNS_A_PAGE))
     page = min(max(query.page, 1), pages)
     return render(
@@ -253,10 +253,10 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
         unknown=sum(run.digest is None for run in found),
         protocols=sorted({run.protocol for run in every if run.protocol}),
         people=first_page.people_of(listed),
-        wanted=wanted,
+        wanted=query,
         page=page,
         pages=pages,
-        href=lambda number: link("/audit", {**wanted.query(), "page": number}),
+        href=lambda number: link("/audit", {**query.query(), "page": number}),
     )
 
 

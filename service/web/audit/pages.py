@@ -189,9 +189,8 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
         values = findings.corrected_values(connection, run_id)
         steps = findings.replaced_steps(connection, run_id, known) if known else []
         seqs = sorted({seq for view in shown for seq in (view.old_seq, view.new_seq) if seq})
-        pictures = {
-            row.seq: row for row in reversed(search.artefacts_of_events(connection, run_id, seqs)) if row.is_picture
-        }
+        files = search.artefacts_of_events(connection, run_id, seqs)
+        pictures = {file.seq: file for file in reversed(files) if file.ref.is_picture}
         corrected = rows.count_of_kind(connection, run_id, "record_corrected")
     return render(
         request,

@@ -24,10 +24,10 @@ from service.core.protocol.models import CalibrationBoard as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.text.words import counted
 from service.core.units import deg, metres, mm
+from service.followed_run import RunRecord
 from service.jobs.calibration_records import ArmAnswer, HandEye
 from service.jobs.records import Camera
 from service.rig import Rig
-from service.run_record import RunRecord
 from service.steps.board_plan import describe_prediction
 from service.steps.context import StationLayout
 from service.steps.kinds.calibration import Params

@@ -13,7 +13,7 @@ from service.core.gates.acceptance import AcceptedGate, depends_on
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.records.events import Event, ViewpointCaptured
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.web.calibration.view import (
     Calibration,
     Certificate,
@@ -41,42 +41,47 @@ router = APIRouter(tags=["calibration"])
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationPage:
-    """The data that the page of a calibration shows.
+class ShownCalibration:
+    """The data that both the page of a calibration and its certificate show.
 
     Attributes:
         run_id: the run's identifier.
         found: the calibration in force.
+        held_out: median and maximum error of the board's position by images that were not used, mm.
+        depends: acceptances on which the calibration depends.
+    """
+
+    run_id: str
+    found: Calibration
+    held_out: tuple[float, float] | None
+    depends: list[AcceptedGate]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPage(ShownCalibration):
+    """The data that the page of a calibration shows.
+
+    Attributes:
         charts: the charts of the intrinsics; None if they are not solved.
         hand_eye_chart: the chart of the hand-eye calibration; None without one.
         images: the images of the board, with their residuals.
-        held_out: median and maximum error of the board's position by images that were not used, mm.
-        depends: acceptances on which the calibration depends.
         regions: parts of the image without corners: name, empty cells, all cells.
         poses: the poses of the board that would help most.
         further: cameras of the rig that are calibrated by themselves.
     """
 
-    run_id: str
-    found: Calibration
     charts: Charts | None
     hand_eye_chart: DotPlot | None
     images: list[ImageRow]
-    held_out: tuple[float, float] | None
-    depends: list[AcceptedGate]
     regions: list[tuple[str, int, int]]
     poses: tuple[PoseAdvice, ...]
     further: tuple[KnownFurtherCamera, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class CertificatePage:
-    """The data that the certificate shows: fields of CalibrationPage, and `head`, the last event of the run."""
+class CertificatePage(ShownCalibration):
+    """The data that the certificate shows; `head` is the last event of the run."""
 
-    run_id: str
-    found: Calibration
-    held_out: tuple[float, float] | None
-    depends: list[AcceptedGate]
     certificate: Certificate
     simulated: bool
     head: Event
@@ -141,9 +146,7 @@ def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
     return _rendered(request, "calibration/certificate.html.j2", shown, run_frame(site, run_id))
 
 
-def _rendered(
-    request: Request, template: str, page: CalibrationPage | CertificatePage, frame: RunFrame
-) -> HTMLResponse:
+def _rendered(request: Request, template: str, page: ShownCalibration, frame: RunFrame) -> HTMLResponse:
     """Return a page with the words for measures and gates."""
     return render(
         request,

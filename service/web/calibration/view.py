@@ -9,16 +9,16 @@ from statistics import median
 from pydantic import BaseModel
 
 from service.core.protocol.models import Step
-from service.core.recorded_devices import RecordedIdentity, recorded_report
+from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_optics, recorded_report
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
 from service.core.run.state import StepState
+from service.followed_run import RunRecord
 from service.jobs import calibrate
 from service.jobs.calibration_records import ArmAnswer, HandEye, Intrinsics, Residuals
 from service.jobs.records import Camera
-from service.run_record import RunRecord
 from service.steps.kinds.calibration import Params
 from service.web.page.charts import DotPlot, HeatMap, VectorField, dots, heat_map, vector_field
-from service.web.record.images import BoardUse, StatedCamera, board_use, captures_of, stated_camera
+from service.web.record.images import BoardUse, board_use, captures_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +253,7 @@ class Certificate:
         stops: troubles of the robot or camera since.
     """
 
-    camera: StatedCamera
+    camera: RecordedOptics
     camera_model: str
     robots: tuple[tuple[str, str, str], ...]
     environment: Mapping[str, float]
@@ -298,11 +298,11 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
         if isinstance(event.payload, DeviceOpened)
     }
     models = [identity.model for identity in known.values() if identity.kind == "camera"]
-    stated = StatedCamera() if first is None else stated_camera(first)
+    stated = RecordedOptics() if first is None else recorded_optics(first.camera)
     robots = [(name, known.get(name, RecordedIdentity())) for name in calibration.robots]
     return Certificate(
         stated,
-        models[-1] if models else stated.model or "",
+        models[-1] if models else stated.model,
         tuple((name, about.model, about.serial) for name, about in robots),
         {} if first is None else first.environment,
         state.operator,

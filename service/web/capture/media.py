@@ -21,9 +21,9 @@ from sqlalchemy import select
 from service.core.errors import OrthocaptureError
 from service.core.records.base import age_s
 from service.core.records.events import ArtefactRef
+from service.followed_run import RunRecord
 from service.monitor.snapshot import ask_for_frames, frame_path
 from service.notes import NOTE_PHOTOGRAPH
-from service.run_record import RunRecord
 from service.store.artefacts import to_artefact
 from service.store.database.tables import artefacts
 from service.web.record.images import Capture, find_capture, further_of, rig_cameras

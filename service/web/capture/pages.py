@@ -13,10 +13,10 @@ from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
 from service.core.protocol.models import Step
+from service.followed_run import RunRecord
 from service.jobs.live_summary import Suggestion
 from service.people.control import Control
 from service.people.person import Person
-from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.images import BoardUse, Capture, board_uses, captures_of, rig_cameras, step_to_show

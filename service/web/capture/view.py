@@ -12,25 +12,24 @@ import numpy as np
 
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Protocol, Step
+from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
+from service.followed_run import RunRecord
 from service.jobs import further_view, live_summary, live_view
-from service.run_record import RunRecord
 from service.steps.notes import suggested_views
 from service.web.record.images import (
     BoardUse,
     Capture,
     FurtherCapture,
-    StatedCamera,
     board_use,
     board_uses,
     calibration_in,
     captures_of,
     further_of,
     last_failures,
-    stated_camera,
 )
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
 
@@ -257,11 +256,11 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
     limit = ""
     if demanded is not None:
         limit = f"wanted {_settings(demanded.aperture_f, demanded.exposure_s, demanded.iso)}"
-    out.append(settings_verdict(stated_camera(payload), payload.verdicts.get("settings"), limit))
+    out.append(settings_verdict(recorded_optics(payload.camera), payload.verdicts.get("settings"), limit))
     return out
 
 
-def settings_verdict(camera: StatedCamera, passed: bool | None, limit: str = "") -> Verdict:
+def settings_verdict(camera: RecordedOptics, passed: bool | None, limit: str = "") -> Verdict:
     """Return the verdict on whether a photograph was taken with the settings that it should have."""
     words = {None: "not judged", True: "As wanted", False: "Differ"}
     figures = _settings(camera.aperture_f, camera.exposure_s, camera.iso)
@@ -276,7 +275,7 @@ def _settings(aperture_f: float | None, exposure_s: float | None, iso: float | N
     parts: list[str] = []
     if aperture_f is not None:
         parts.append(f"f/{aperture_f:g}")
-    if exposure_s is not None and exposure_s > 0:
+    if exposure_s is not None:
         parts.append(f"1/{1 / exposure_s:.0f} s" if exposure_s < 0.5 else f"{exposure_s:g} s")
     if iso is not None:
         parts.append(f"ISO {iso:.0f}")
@@ -383,11 +382,11 @@ def camera_images(
         verdicts: the verdicts on the first camera's image.
         others: valid captures of the step, whose images each camera's is compared with.
     """
-    size = stated_camera(capture.payload)
+    size = recorded_optics(capture.payload.camera)
     images = [CameraImage("", "on the arm", capture.sha256, size.width or 3, size.height or 2, verdicts)]
     beside = {name: [job.live for job in mine] for name, mine in _by_device(log, others).items()}
     for one in further_of(log, capture):
-        stated, device = stated_camera(one.exposure), one.exposure.device
+        stated, device = recorded_optics(one.exposure.camera), one.exposure.device
         found = looked_at(one.live, beside.get(device, ()), _FEWEST_SPHERES)
         found.append(settings_verdict(stated, one.exposure.verdicts.get("settings")))
         place = _MOUNTED[one.exposure.mounted]
@@ -413,13 +412,13 @@ def sheet_image(log: RunRecord, capture: Capture, uses: Mapping[str, BoardUse], 
     if device:
         mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
         return None if mine is None else _of_further(capture, mine)
-    size = stated_camera(capture.payload)
+    size = recorded_optics(capture.payload.camera)
     word, tone, why = _word(capture, uses.get(capture.sha256))
     return SheetImage(capture, capture.sha256, size.width or 3, size.height or 2, word, tone, why)
 
 
 def _of_further(capture: Capture, mine: FurtherCapture) -> SheetImage:
-    size = stated_camera(mine.exposure)
+    size = recorded_optics(mine.exposure.camera)
     if capture.replaced is not None:
         word, tone, why = "Replaced", "quiet", capture.replaced.reason
     elif mine.exposure.verdicts.get("settings") is False:

@@ -11,9 +11,9 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from service.core.protocol.models import Step
 from service.core.records.events import CaptureAsked
 from service.core.run.actions import capture_refusal
+from service.followed_run import RunRecord
 from service.people.control import Control
 from service.people.person import Person
-from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.images import step_to_show

@@ -15,9 +15,9 @@ from service.core.protocol.models import Protocol, Step
 from service.core.recorded_devices import recorded_report
 from service.core.records.events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
+from service.followed_run import RunRecord
 from service.jobs import coverage_points, hand_board, hand_view
 from service.jobs.records import Matrix, image_of
-from service.run_record import RunRecord
 from service.steps.handheld import failure_words
 from service.web.page.run_frame import limit
 from service.web.record.images import captures_of

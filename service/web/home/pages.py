@@ -9,15 +9,15 @@ from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
-from service.audit.runs.search import RESULT_WORDS, RESULTS, RunSearch, find_runs
+from service.audit.filters import RunSearch
+from service.audit.runs.comparison import ComparedRun, compare_runs
+from service.audit.runs.search import RESULT_WORDS, find_runs
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.gates.measure_names import measure_name
 from service.core.protocol.models import LoadedProtocol, Protocol, irreversible_warning, load_protocol
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
-from service.core.records.events import RunStarted
 from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
@@ -66,18 +66,10 @@ class StartableProtocol:
     changes: tuple[str, ...] = ()  # changes against the approved content of its id and version
 
 
-class HomeQuery(BaseModel):
-    """Page number and search of the first page."""
+class HomeQuery(RunSearch):
+    """A page of the runs, or of those that match a search."""
 
     page: int = Field(1, ge=1, le=100_000)
-    q: str = Field("", max_length=200)
-    since: str = Field("", max_length=200)
-    until: str = Field("", max_length=200)
-    result: str = Field("", max_length=200)
-
-    def wanted(self) -> RunSearch:
-        """Return the search."""
-        return RunSearch(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
 
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
@@ -85,17 +77,16 @@ def home(
     request: Request,
     site: CurrentSite,
     person: SignedInPerson,
-    asked_for: Annotated[HomeQuery, Query()],
+    wanted: Annotated[HomeQuery, Query()],
 ) -> HTMLResponse:
     """Show the runs in progress, then those that have ended, newest first, or those that match a search.
 
     Only the runs of the page shown are read whole.
     """
-    wanted = asked_for.wanted()
-    found = {run.run_id: run for run in find_runs(site.store, wanted)}
+    found = {run.basics.run_id: run for run in find_runs(site.store, wanted)}
     rows = _in_order(site, found)
     pages = max(1, -(-len(rows) // _PAGE))
-    page = min(asked_for.page, pages)
+    page = min(wanted.page, pages)
     lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
     asked = person.may("operate") and not wanted.active
     startable = [startable_of(path.name, site) for path in site.protocol_files()] if asked else []
@@ -186,7 +177,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
         robot=robot,
         standing=standing,
         why=why,
-        about=root.about or RunAbout() if isinstance(root := log.events[0].payload, RunStarted) else RunAbout(),
+        about=log.root.about or RunAbout(),
     )
 
 
@@ -217,7 +208,7 @@ def start_form(
             where=str(site.protocols),
             remedy="Choose one of the first page",
         )
-    earlier = [run.about for run in find_runs(site.store, RunSearch())]
+    earlier = [run.basics.about for run in find_runs(site.store, RunSearch())]
     return render(
         request,
         "home/start.html.j2",
@@ -252,9 +243,7 @@ def protocol_checklist(
 def run_checklist(request: Request, site: CurrentSite, run_id: Annotated[str, Path(max_length=64)]) -> HTMLResponse:
     """Show the checklist of the protocol that a run began with."""
     log = site.run(run_id)
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the run was read
-    return _page(request, log.protocol, root.protocol_sha256, run_id=run_id, frame=run_frame(site, run_id))
+    return _page(request, log.protocol, log.root.protocol_sha256, run_id=run_id, frame=run_frame(site, run_id))
 
 
 def _page(
@@ -287,9 +276,9 @@ def compare_page(
 ) -> HTMLResponse:
     """Show two runs, or the choice of two. Raises UnknownRunError."""
     chosen = list(dict.fromkeys(run or []))
-    comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
+    comparison = compare_runs(*(ComparedRun.of(site.run(run_id)) for run_id in chosen)) if len(chosen) == 2 else None
     offered = find_runs(site.store, RunSearch())[:_OFFERED]
-    missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
+    missing = [run_id for run_id in chosen if run_id not in {each.basics.run_id for each in offered}]
     return render(
         request,
         "home/compare.html.j2",
@@ -299,10 +288,3 @@ def compare_page(
         missing=missing,
         measure_name=measure_name,
     )
-
-
-def _run(site: Site, run_id: str) -> ComparedRun:
-    log = site.run(run_id)
-    root = root_of(log.events)
-    source = site.store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
-    return ComparedRun(run_id, root, log.protocol, source, tuple(log.events), log.state)

@@ -1,10 +1,11 @@
-"""Small charts as coordinates for SVG, which calibration/templates/charts.html.j2 draws in the theme's ink."""
+"""Small charts as coordinates for SVG, which page/templates/charts.html.j2 draws in the theme's ink."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 WIDTH = 640.0
 LEVELS = 8  # shades of a heat map
@@ -20,6 +21,16 @@ class Tick:
 
 
 @dataclass(frozen=True, slots=True)
+class Chart:
+    """A chart: its title, its height, and the marks on its axes."""
+
+    title: str
+    height: float
+    x_ticks: tuple[Tick, ...]
+    y_ticks: tuple[Tick, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class HeatMapCell:
     """A cell of a heat map; `text` is "" where there is no room."""
 
@@ -30,17 +41,13 @@ class HeatMapCell:
 
 
 @dataclass(frozen=True, slots=True)
-class HeatMap:
+class HeatMap(Chart):
     """Values over the image."""
 
-    title: str
     unit: str
-    height: float
     cell_width: float
     cell_height: float
     cells: tuple[HeatMapCell, ...]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
     scale: tuple[str, ...]  # lower end of each level, then the highest value
     font: float
 
@@ -56,14 +63,10 @@ class Arrow:
 
 
 @dataclass(frozen=True, slots=True)
-class VectorField:
+class VectorField(Chart):
     """Vectors over the image; `bar` is the length of `bar_text`."""
 
-    title: str
-    height: float
     arrows: tuple[Arrow, ...]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
     bar: float
     bar_text: str
 
@@ -78,15 +81,11 @@ class ChartPoint:
 
 
 @dataclass(frozen=True, slots=True)
-class DotPlot:
+class DotPlot(Chart):
     """Values of several series for each name, along the x axis; the series differ in shape."""
 
-    title: str
-    height: float
     marks: tuple[ChartPoint, ...]
     series: tuple[str, ...]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
     limit: float | None  # y of it
     limit_text: str
 
@@ -132,8 +131,8 @@ def heat_map(
     edges = [low * (high / low) ** (k / LEVELS) if logarithmic and low > 0 else low + (high - low) * k / LEVELS
              for k in range(LEVELS + 1)]  # fmt: skip
     return HeatMap(
-        title, unit, round(inner + _TOP + _BOTTOM, 1), round(w, 2), round(h, 2), tuple(cells),
-        *_pixel_ticks(image_px, inner), tuple(f"{edge:.2g}" if digits else f"{edge:.0f}" for edge in edges),
+        title, round(inner + _TOP + _BOTTOM, 1), *_pixel_ticks(image_px, inner), unit, round(w, 2), round(h, 2),
+        tuple(cells), tuple(f"{edge:.2g}" if digits else f"{edge:.0f}" for edge in edges),
         round(min(17.0, 0.42 * every * w / max(1, digits + 1) + 4), 1),
     )  # fmt: skip
 
@@ -162,9 +161,7 @@ def vector_field(
         for r, c, x, y in kept
     )
     bar, height = _nice(longest), round(inner + _TOP + _BOTTOM, 1)
-    return VectorField(
-        title, height, arrows, *_pixel_ticks(image_px, inner), round(bar * scale, 1), f"{bar:g} px"
-    )  # fmt: skip
+    return VectorField(title, height, *_pixel_ticks(image_px, inner), arrows, round(bar * scale, 1), f"{bar:g} px")
 
 
 def dots(
@@ -199,7 +196,7 @@ def dots(
     spacing = _nice(top / 4)
     y_ticks = tuple(Tick(y(k * spacing), f"{k * spacing:g}") for k in range(int(top / spacing) + 1))
     at = y(limit) if limit is not None and drawn else None
-    return DotPlot(title, height, tuple(marks), tuple(n for n, _ in series), x_ticks, y_ticks, at, limit_text)
+    return DotPlot(title, height, x_ticks, y_ticks, tuple(marks), tuple(n for n, _ in series), at, limit_text)
 
 
 def _pixel_ticks(image_px: tuple[int, int], inner: float) -> tuple[tuple[Tick, ...], tuple[Tick, ...]]:
@@ -213,9 +210,143 @@ def _pixel_ticks(image_px: tuple[int, int], inner: float) -> tuple[tuple[Tick, .
     )
 
 
-def _nice(value: float) -> float:
-    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a value."""
+def _nice(value: float, *, above: bool = False) -> float:
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a value or, with `above`, the smallest not below it."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
+    if above:
+        return next(k * power for k in (1, 2, 5, 10) if k * power >= value * 0.9999999)
     return next(k * power for k in (5, 2, 1) if k * power <= value * 1.0000001)
+
+
+# --- over time ------------------------------------------------------------------------------------------------------
+
+_TIME_LEFT, _TIME_RIGHT, _TIME_TOP, _TIME_BOTTOM = 92.0, 20.0, 14.0, 44.0
+_HEIGHT = 300.0
+_DAY_S = 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class TimePoint:
+    """A value at a time; `of` says whose."""
+
+    at_utc: str
+    value: float
+    of: str
+    simulated: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TimeMark:
+    """A point in the drawing; `text` for who points at it."""
+
+    x: float
+    y: float
+    simulated: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimeChart(Chart):
+    """Points over time, a line through those of real rigs and one through the simulated, and the newest limit."""
+
+    summary: str  # the same in a sentence
+    marks: tuple[TimeMark, ...]
+    lines: tuple[str, ...]  # paths
+    limit: float | None  # y of it
+    limit_text: str
+    left: float = _TIME_LEFT
+    right: float = WIDTH - _TIME_RIGHT
+    bottom: float = _HEIGHT - _TIME_BOTTOM
+
+
+def time_chart(
+    points: Sequence[TimePoint], *, title: str, unit: str, from_zero: bool = True, limit: float | None = None
+) -> TimeChart | None:
+    """Return a chart of points in order of time; None if there are no points.
+
+    Args:
+        points: the points, oldest first.
+        title: the chart's title.
+        unit: the values' unit.
+        from_zero: the axis begins at zero; otherwise it spans the values.
+        limit: the largest value that the protocol allows; None if it sets no limit.
+    """
+    if not points:
+        return None
+    times = [datetime.fromisoformat(point.at_utc).timestamp() for point in points]
+    low, high = _range([p.value for p in points], limit, from_zero=from_zero)
+    first, last = min(times), max(times)
+    margin = max(0.04 * (last - first), 1800.0)  # a single point stands in the middle
+    first, last = first - margin, last + margin
+
+    def x(at_s: float) -> float:
+        return round(_TIME_LEFT + (WIDTH - _TIME_LEFT - _TIME_RIGHT) * (at_s - first) / (last - first), 1)
+
+    def y(value: float) -> float:
+        return round(_TIME_TOP + (_HEIGHT - _TIME_TOP - _TIME_BOTTOM) * (high - value) / (high - low), 1)
+
+    marks = tuple(
+        TimeMark(x(at_s), y(p.value), p.simulated, _mark_label(p, unit))
+        for at_s, p in zip(times, points, strict=True)
+    )
+    newest = points[-1].value
+    summary = f"{len(points)} value{'' if len(points) == 1 else 's'}, the newest {newest:.5g} {unit}".rstrip()
+    drawn = limit is not None and low <= limit <= high
+    spacing = _nice((high - low) / 4, above=True)
+    count = range(math.ceil(low / spacing - 1e-9), math.floor(high / spacing + 1e-9) + 1)
+    digits = max(0, -math.floor(math.log10(spacing)))
+    return TimeChart(
+        title=f"{title} ({unit})" if unit else title,
+        summary=summary,
+        height=_HEIGHT,
+        marks=marks,
+        lines=_lines(marks),
+        x_ticks=tuple(Tick(x(at_s), label) for at_s, label in _days(first, last)),
+        y_ticks=tuple(Tick(y(k * spacing), f"{k * spacing:.{digits}f}") for k in count),
+        limit=y(limit) if drawn and limit is not None else None,
+        limit_text="" if limit is None else f"limit of the newest run {limit:g}",
+    )
+
+
+def _mark_label(point: TimePoint, unit: str) -> str:
+    at = point.at_utc[:16].replace("T", " ")
+    return f"{point.value:.5g} {unit}, {at} UTC, {point.of}" + (", simulated" if point.simulated else "")
+
+
+def _lines(marks: Sequence[TimeMark]) -> tuple[str, ...]:
+    """Return SVG paths through the marks of real rigs and of simulated ones, where there is more than one."""
+    groups = ([mark for mark in marks if mark.simulated == simulated] for simulated in (False, True))
+    return tuple("M" + "L".join(f"{mark.x} {mark.y}" for mark in group) for group in groups if len(group) > 1)
+
+
+def _range(values: Sequence[float], limit: float | None, *, from_zero: bool) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    if from_zero and low >= 0:
+        most = (
+            max(high, limit) if limit is not None and limit < 4 * high else high
+        )  # a far one would flatten the rest
+        return 0.0, 1.1 * most or 1.0
+    apart = high - low or 0.002 * abs(high) or 1.0
+    return low - 0.25 * apart, high + 0.25 * apart
+
+
+def _days(first: float, last: float) -> list[tuple[float, str]]:
+    """Return up to five times on whole hours, days, or multiples of them, in UTC."""
+    steps = (
+        900.0,
+        3600.0,
+        3 * 3600.0,
+        6 * 3600.0,
+        _DAY_S,
+        2 * _DAY_S,
+        7 * _DAY_S,
+        14 * _DAY_S,
+        30 * _DAY_S,
+        91 * _DAY_S,
+    )
+    step = next((s for s in steps if (last - first) / s <= 4), 365 * _DAY_S)
+    at = [k * step for k in range(math.ceil(first / step), math.floor(last / step) + 1)]
+    pattern = "%m-%d %H:%M" if step < _DAY_S else "%Y-%m-%d"
+    return [(s, datetime.fromtimestamp(s, UTC).strftime(pattern)) for s in at[:5]]

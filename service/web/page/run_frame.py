@@ -10,7 +10,7 @@ from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing as GateStanding
 from service.core.gates.verdict import figure, standing
 from service.core.protocol.models import Protocol, Step
-from service.core.records.events import GateVerdict, RunStarted
+from service.core.records.events import GateVerdict
 from service.core.records.import_list import imported_sentence
 from service.core.recovery import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator, Decision, decide
@@ -18,9 +18,9 @@ from service.core.run.expected import tries_words
 from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState, lost_arms
 from service.core.text.words import time_here
+from service.followed_run import RunRecord
 from service.monitor.snapshot import STOPS, RobotPhase, Standing, read_snapshot
 from service.people.control import Control
-from service.run_record import RunRecord
 from service.steps import step_kinds
 from service.steps.coats import Coat, coats
 from service.steps.context import ROBOT_MOVES, Announcement, BeforeStep
@@ -265,8 +265,7 @@ class RunFrame:
 def run_frame(site: Site, run_id: str) -> RunFrame:
     """Return the frame of a run's pages. Raises UnknownRunError."""
     log = site.run(run_id)
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the run was read
+    root = log.root
     here = f"/runs/{run_id}"
     now_utc_s = site.store.clock.utc_s()
     holder = Control(site.store).holder(run_id)

@@ -9,51 +9,24 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import BaseModel, ConfigDict
-
 from service.core.protocol.models import Step
 from service.core.records.events import (
     Event,
     FurtherExposure,
     RecordedView,
-    RunStarted,
     ViewpointCaptured,
     ViewpointFailed,
 )
 from service.core.run.state import JobState, RunState, StepState, Superseded
+from service.followed_run import RunRecord
 from service.jobs import board_view, calibrate, further_view, live_view
 from service.jobs.calibration_records import Intrinsics
 from service.jobs.records import image_of
 from service.rig import RigSection, parse_recorded_rig
-from service.run_record import RunRecord
 from service.steps.notes import board_plans
 
 if TYPE_CHECKING:
     from service.dataset.further_cameras import KnownFurtherCamera
-
-
-class StatedCamera(BaseModel):
-    """Camera, lens and settings as a photograph states them; None where it does not."""
-
-    model_config = ConfigDict(frozen=True)
-
-    model: str | None = None
-    body_serial: str | None = None
-    lens: str | None = None
-    lens_serial: str | None = None
-    focal_length_mm: float | None = None
-    aperture_f: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-    focus_mode: str | None = None
-    focus_distance_m: float | None = None
-    width: int | None = None
-    height: int | None = None
-
-
-def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
-    """Return what the photograph of a view states about the camera."""
-    return StatedCamera.model_validate(view.camera)
 
 
 def step_to_show(log: RunRecord, steps: Sequence[Step], wanted: str) -> Step | None:
@@ -287,9 +260,7 @@ def _plain(reason: str) -> str:
 
 def recorded_rig_section(log: RunRecord) -> RigSection:
     """Return what the rig file of the run says. Raises ConfigurationError if this version cannot read it."""
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the record was read
-    return _section(log.store.artefact_path(root.rig.sha256))
+    return _section(log.store.artefact_path(log.root.rig.sha256))
 
 
 def rig_cameras(log: RunRecord) -> tuple[str, ...]:

@@ -22,10 +22,10 @@ from service.core.units import metres
 from service.dataset.further_cameras import further_pose
 from service.dataset.registrations import best_registration, further_cameras, registrations
 from service.dataset.summary import control_centres, control_scan, registered_scan
+from service.followed_run import RunRecord
 from service.jobs import further_view, live_view, locate_spheres
 from service.jobs.records import Matrix, SpheresFound
 from service.jobs.register import Registration
-from service.run_record import RunRecord
 from service.web.record.images import Capture, further_of
 from service.web.record.pictures import DrawnOutline
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from service.core.geometry import Transform
 from service.core.protocol.models import Step
-from service.run_record import RunRecord
+from service.followed_run import RunRecord
 from service.steps.context import StationLayout
 from service.steps.kinds import calibration
 from service.steps.notes import BOARD_POSES, SUGGESTION, board_plans, suggested_views

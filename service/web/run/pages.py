@@ -24,13 +24,14 @@ from service.core.protocol.models import Reasons, Step
 from service.core.records.entered import NoteTaken, about_rows
 from service.core.records.events import ArtefactRef, ControlTaken, Event, RunStarted
 from service.dataset.registrations import evaluated, shared_adjustment_note
+from service.followed_run import RunRecord
 from service.jobs.evaluate import Row
 from service.monitor.snapshot import STALE_S, read_snapshot
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.control import Control
 from service.people.person import Account, Person
 from service.rig import SigningSection
-from service.run_record import RunRecord, open_jobs, results_to_come
+from service.run_record import open_jobs, results_to_come
 from service.steps import step_kinds
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import utc_text

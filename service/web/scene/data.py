@@ -20,10 +20,10 @@ from service.dataset.further_cameras import KnownFurtherCamera, further_poses
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated, viewing_frame
 from service.dataset.summary import registered_scan
+from service.followed_run import RunRecord
 from service.jobs import further_view, fuse
 from service.jobs.records import Point
 from service.jobs.register import Registration
-from service.run_record import RunRecord
 from service.web.record.images import captures_of, further_cameras_of, further_of
 from service.web.record.outlines import (
     DisplayedRegistration,

@@ -9,10 +9,10 @@ from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
 from service.core.gates.acceptance import accepted_gates
+from service.followed_run import RunRecord
 from service.jobs import fuse
 from service.people.control import Control
 from service.run_acts import drawing_step, read_region, step_to_draw_for
-from service.run_record import RunRecord
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
 from service.web.security import SignedInPerson, requires

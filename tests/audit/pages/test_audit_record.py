@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.audit.background import PartialProgress
+from service.audit.filters import ArtefactFilter, EventFilter
 from service.audit.overview import findings, first_page
 from service.audit.overview.digest import digests
 from service.audit.overview.findings import correct
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.provenance import draw, graphs, origin
 from service.audit.record import rows, search
-from service.audit.record.search import EventFilter, EventPage
+from service.audit.record.search import EventPage
 from service.core.errors import DataError
 from service.core.records.events import StepNote
 from service.core.run.fold import fold
@@ -185,18 +186,18 @@ def test_artefacts_are_found_by_every_property(store: Store, run: str) -> None:
     one = next(a for a in every if a.viewpoint == "v00007" and a.ref.kind == "image")
     with store.database.reading() as connection:
         for wanted, expected in (
-            (search.ArtefactFilter(), len(every)),
-            (search.ArtefactFilter(kind="ct_slice"), SMALL.slices),
-            (search.ArtefactFilter(device="robot"), SMALL.viewpoints + SMALL.redone_viewpoints),
-            (search.ArtefactFilter(viewpoint="v00007"), 2),
-            (search.ArtefactFilter(q=one.ref.sha256[:16]), 1),
-            (search.ArtefactFilter(q="dsc00007 image"), 1),
-            (search.ArtefactFilter(q="%"), 0),
-            (search.ArtefactFilter(q="SC0000_"), 0),
+            (ArtefactFilter(), len(every)),
+            (ArtefactFilter(kind="ct_slice"), SMALL.slices),
+            (ArtefactFilter(device="robot"), SMALL.viewpoints + SMALL.redone_viewpoints),
+            (ArtefactFilter(viewpoint="v00007"), 2),
+            (ArtefactFilter(q=one.ref.sha256[:16]), 1),
+            (ArtefactFilter(q="dsc00007 image"), 1),
+            (ArtefactFilter(q="%"), 0),
+            (ArtefactFilter(q="SC0000_"), 0),
         ):
             found = search.artefacts_page(connection, run, wanted)
             assert found.count == expected, wanted
-        last = search.artefacts_page(connection, run, search.ArtefactFilter(), page=10**9)
+        last = search.artefacts_page(connection, run, ArtefactFilter(), page=10**9)
         assert last.page == last.pages
         with pytest.raises(UnknownRunError):
             search.one_artefact(connection, run, "'; DROP TABLE artefacts")
@@ -231,9 +232,9 @@ def test_files_of_a_job_are_its_inputs_and_its_results(store: Store, run: str) -
         made = origin(connection, run, result.ref.sha256)
         source = origin(connection, run, image.ref.sha256)
     assert made.job is not None
-    assert image.ref.sha256 in {row.sha256 for row in made.inputs}
-    assert result.ref.sha256 in {row.sha256 for row in source.made_of_it}
-    assert [row.kind for row in source.beside] == ["pose_log"]
+    assert image.ref.sha256 in {row.ref.sha256 for row in made.inputs}
+    assert result.ref.sha256 in {row.ref.sha256 for row in source.made_of_it}
+    assert [row.ref.kind for row in source.beside] == ["pose_log"]
 
 
 # --- corrections and signatures ---------------------------------------------------------------------------------
@@ -248,7 +249,7 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
         with store.database.reading() as connection:
             values = findings.corrected_values(connection, run)
             original = rows.one_event(connection, run, 2)
-        assert [(v.old, v.new, v.original, v.latest) for v in values] == [
+        assert [(v.correction.old, v.correction.new, v.original, v.latest) for v in values] == [
             ("here", "table 2", "here", False),
             (1, 7, 1, True),
             ("here", "table 3", "here", True),

@@ -11,7 +11,7 @@ from drivers.interfaces import RobotArm
 _WITHIN_S, _PAUSE_S = 90.0, 0.1
 
 
-def confirmed(arm: RobotArm, motion: Callable[[], None]) -> None:
+def confirm_and(arm: RobotArm, motion: Callable[[], None]) -> None:
     """Let the arm move and call `motion`; both again as long as a lapse of this machine takes the leave away."""
     deadline_s = time.monotonic() + _WITHIN_S
     while True:

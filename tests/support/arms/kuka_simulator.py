@@ -46,5 +46,5 @@ def transcript(name: str) -> list[dict[str, Any]]:
 
 
 def agrees(line: dict[str, Any], golden: dict[str, Any]) -> bool:
-    """Whether a line has the fields of the golden one, and its values where that is not `*`."""
+    """Return whether a line has the fields of the golden one, and its values where that is not `*`."""
     return line.keys() == golden.keys() and all(value in ("*", line[name]) for name, value in golden.items())

@@ -62,15 +62,15 @@ class Program:
     def let_move(self, person: str) -> None:
         """Let the arm move for a person; again while it is refused because the stream is old, say."""
         until_s = time.monotonic() + _WITHIN_S
-        told: dict[str, Any] = {}
-        while told.get("let_by") != person:
-            assert time.monotonic() < until_s, told
-            self._tell(person)
-            told = self.next("let_by")
+        answer: dict[str, Any] = {}
+        while answer.get("let_by") != person:
+            assert time.monotonic() < until_s, answer
+            self._write(person)
+            answer = self.next("let_by")
 
     def hang(self) -> None:
         """Let its main loop hang as soon as the arm moves."""
-        self._tell("hang")
+        self._write("hang")
 
     def go_on(self, person: str, moving: Callable[[], bool]) -> None:
         """Let the arm move until it does, once more when this machine's lapse has taken the leave away."""
@@ -121,7 +121,7 @@ class Program:
                 if pipe is not None:
                     pipe.close()
 
-    def _tell(self, line: str) -> None:
+    def _write(self, line: str) -> None:
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()

@@ -114,7 +114,7 @@ class Forked(subprocess.Popen[AnyStr]):
 
     @property
     def is_fork(self) -> bool:
-        """Whether it is a fork, rather than a real start."""
+        """Return whether it is a fork, rather than a real start."""
         return self._news is not None
 
     def poll(self) -> int | None:
@@ -236,7 +236,7 @@ def _of_the_program(words: object) -> dict[str, Any] | None:
 
 
 def _forks() -> bool:
-    """Whether this machine has what it takes, and one thread of linear algebra, as the zygote must not have more."""
+    """Say whether this machine can fork, and has one thread of linear algebra: the zygote must not have more."""
     return hasattr(os, "pidfd_open") and _ENVIRONMENT.get("OPENBLAS_NUM_THREADS") == "1"
 
 
@@ -247,7 +247,7 @@ def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def _states_parent(words: Sequence[str], at: int) -> bool:
-    """Whether this word names this process as the parent, which for a fork is the zygote."""
+    """Return whether this word names this process as the parent, which for a fork is the zygote."""
     return at > 0 and words[at - 1] == _PARENT and words[at] == str(os.getpid())
 
 

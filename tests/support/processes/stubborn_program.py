@@ -29,7 +29,7 @@ def main() -> None:
     config = load_spec(spec).config.model_validate_json(given)
     *goals_rad, speed_rad_s, acceleration_rad_s2 = map(float, numbers)
     arm = hosted(RobotArm, spec, config, call_timeout_s=60, name="robot")
-    while not _opened(arm):
+    while not _open(arm):
         time.sleep(0.1)
     persons: list[tuple[str, float]] = []
     hangs = threading.Event()
@@ -61,7 +61,7 @@ def main() -> None:
                 say(error=said, message=str(error), driver=device.pid)
             time.sleep(0.1)
             if isinstance(error, DeviceUnavailableError):
-                _opened(arm)
+                _open(arm)
 
 
 def _let_move(arm: RobotArm, name: str, asked_s: float) -> None:
@@ -73,7 +73,7 @@ def _let_move(arm: RobotArm, name: str, asked_s: float) -> None:
     say(let_by=name)
 
 
-def _opened(arm: RobotArm) -> bool:
+def _open(arm: RobotArm) -> bool:
     try:
         arm.open()
     except DeviceError as error:

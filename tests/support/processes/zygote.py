@@ -75,12 +75,12 @@ class _Request:
 
     @property
     def is_rig(self) -> bool:
-        """Whether it starts simulators itself."""
+        """Return whether it starts simulators itself."""
         return self.module == SIMULATORS and self.words[:1] == [_RIG]
 
     @property
     def starts_others(self) -> bool:
-        """Whether it starts processes that can be forked."""
+        """Return whether it starts processes that can be forked."""
         return self.is_rig or (self.module == COMMANDS and "".join(self.words[:1]) in _STARTING)
 
     @property

@@ -119,7 +119,7 @@ class Attempt:
 
     @property
     def refused_for_its_name(self) -> bool:
-        """Whether a command was refused because of the name, and nothing was recorded."""
+        """Return whether a command was refused because of the name, and nothing was recorded."""
         return self.status == 1 and self.refusal in OF_NAMES and not self.since
 
 

@@ -35,7 +35,7 @@ def at_rest(receive: Receive) -> list[float]:
 
 
 def unlocked(dashboard: Any) -> bool:
-    """Whether the protective stop could be released, for which some time must have passed."""
+    """Return whether the protective stop could be released, for which some time must have passed."""
     try:
         dashboard.unlockProtectiveStop()
     except RuntimeError:

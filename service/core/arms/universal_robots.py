@@ -1,6 +1,8 @@
-"""What all arms of Universal Robots have in common: their DH table's layout, their links, and what may touch."""
+"""The arms of Universal Robots, a row each, and what they have in common: DH layout, links, and what may touch."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -88,3 +90,73 @@ def _links(a2: float, a3: float, d4: float, d5: float, d6: float) -> tuple[Link,
         Link("wrist 2", 4, (0, 0, 0), (0, 0, d5), 0.055 * scale),
         Link("wrist 3", 5, (0, 0, 0), (0, 0, d6), 0.05 * scale),
     )
+
+
+#: By the name of a row. Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics"
+#: (support article), and the data sheets.
+ARMS: Mapping[str, ArmModel] = {
+    "ur10": universal_robot(
+        "UR10",
+        a_m=(-0.612, -0.5723),
+        d_m=(0.1273, 0.163941, 0.1157, 0.0922),
+        speeds_deg_s=(120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
+        payload_kg=10.0,
+    ),
+    "ur10e": universal_robot(
+        "UR10e",
+        a_m=(-0.6127, -0.57155),
+        d_m=(0.1807, 0.17415, 0.11985, 0.11655),
+        speeds_deg_s=(120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
+        payload_kg=12.5,
+    ),
+    "ur16e": universal_robot(
+        "UR16e",
+        a_m=(-0.4784, -0.36),
+        d_m=(0.1807, 0.17415, 0.11985, 0.11655),
+        speeds_deg_s=(120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
+        payload_kg=16.0,
+    ),
+    "ur20": universal_robot(
+        "UR20",
+        a_m=(-0.8620, -0.7287),
+        d_m=(0.2363, 0.2010, 0.1593, 0.1543),
+        speeds_deg_s=(120.0, 120.0, 150.0, 210.0, 210.0, 210.0),
+        payload_kg=20.0,
+    ),
+    "ur3": universal_robot(
+        "UR3",
+        a_m=(-0.24365, -0.21325),
+        d_m=(0.1519, 0.11235, 0.08535, 0.0819),
+        speeds_deg_s=(180.0, 180.0, 180.0, 360.0, 360.0, 360.0),
+        payload_kg=3.0,
+    ),
+    "ur30": universal_robot(
+        "UR30",
+        a_m=(-0.6370, -0.5037),
+        d_m=(0.2363, 0.2010, 0.1593, 0.1543),
+        speeds_deg_s=(120.0, 120.0, 150.0, 210.0, 210.0, 210.0),
+        payload_kg=30.0,
+    ),
+    "ur3e": universal_robot(
+        "UR3e",
+        a_m=(-0.24355, -0.2132),
+        d_m=(0.15185, 0.13105, 0.08535, 0.0921),
+        speeds_deg_s=(180.0, 180.0, 180.0, 360.0, 360.0, 360.0),
+        payload_kg=3.0,
+    ),
+    "ur5": universal_robot(
+        "UR5",
+        a_m=(-0.425, -0.39225),
+        d_m=(0.089159, 0.10915, 0.09465, 0.0823),
+        speeds_deg_s=(180.0, 180.0, 180.0, 180.0, 180.0, 180.0),
+        payload_kg=5.0,
+    ),
+    "ur5e": universal_robot(
+        "UR5e",
+        a_m=(-0.425, -0.3922),
+        d_m=(0.1625, 0.1333, 0.0997, 0.0996),
+        speeds_deg_s=(180.0, 180.0, 180.0, 180.0, 180.0, 180.0),
+        payload_kg=5.0,
+        elbow_deg=180.0,
+    ),
+}

@@ -1,6 +1,8 @@
-"""What the LBR arms of KUKA have in common: three joints that meet in the shoulder, the elbow, three in the wrist."""
+"""The LBR arms of KUKA, a row each: three joints that meet in the shoulder, the elbow, three in the wrist."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,20 +20,6 @@ _ALLOWED = frozenset(
 _ACCELERATION_RAD_S2 = 15.0
 _BRAKING_RAD_S2 = 4.0  # of a motion that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
-
-
-def lbr_r820(name: str) -> ArmModel:
-    """Return an LBR with a reach of 820 mm, which is made for industry (iiwa) and for medical devices (Med).
-
-    Source: KUKA, specifications "LBR iiwa 7 R800, LBR iiwa 14 R820" and "LBR Med": dimensions, axis ranges, speeds.
-    """
-    return lbr(
-        name,
-        offsets_m=(0.360, 0.420, 0.400, 0.126),
-        limits_deg=(170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0),
-        speeds_deg_s=(85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0),
-        payload_kg=14.0,
-    )
 
 
 def lbr(
@@ -75,3 +63,18 @@ def lbr(
         # Its joints have no link lengths to get wrong, but springs: the torque sensors yield under load.
         tolerances=ArmTolerances(dh=(0.2e-3, 0.2e-3, float(np.radians(0.02)), float(np.radians(0.05)))),
     )
+
+
+#: By the name of a row. Both have a reach of 820 mm and the same dimensions, axis ranges and speeds; one is made for
+#: industry, the other for medical devices. Source: KUKA, specifications "LBR iiwa 7 R800, LBR iiwa 14 R820" and
+#: "LBR Med".
+ARMS: Mapping[str, ArmModel] = {
+    row: lbr(
+        name,
+        offsets_m=(0.360, 0.420, 0.400, 0.126),
+        limits_deg=(170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0),
+        speeds_deg_s=(85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0),
+        payload_kg=14.0,
+    )
+    for row, name in {"lbr_iiwa_14": "LBR iiwa 14", "lbr_med_14": "LBR Med 14"}.items()
+}
