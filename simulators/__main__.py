@@ -40,7 +40,7 @@ _SIMULATORS = {
     "ur": ("simulators.ur_controller", "a Universal Robots controller: RTDE, dashboard, script port"),
     "kuka": ("simulators.kuka_controller", "a KUKA controller with our Sunrise application"),
     "camera": ("simulators.sony_camera", "a Sony ILCE-7RM5 over PTP/IP, or another that was recorded"),
-    "canon": ("simulators.canon_camera", "a Canon EOS R5 over PTP/IP"),
+    "canon": ("simulators.canon_camera", "a Canon EOS R5 over PTP/IP, or another EOS that was recorded"),
     "nikon": ("simulators.nikon_camera", "a Nikon Z that was recorded, over PTP/IP"),
     "gige": ("simulators.gige_camera", "an industrial camera over GigE Vision"),
     "video": ("simulators.video_camera", "a camera whose video goes into a named pipe"),

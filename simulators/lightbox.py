@@ -6,23 +6,29 @@ import argparse
 import binascii
 import json
 import logging
+import re
 import signal
 import socket
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
 from simulators.faults import Fault, FaultPlan
+from simulators.recordings import TAKEN_OUT, RecordedDevice, add_replay, recorded_device
 from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
-from simulators.units import ms
+from simulators.units import ms, seconds
 
 log = logging.getLogger(__name__)
 
 BANNER = b"# ORTHO-LB1 light and environment box ready\r\n"
-IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001"
+MODEL, SERIAL = "orthocapture,ORTHO-LB1 simulated", "LB-0001"
 FIRMWARES = ("1.2", "1.3", "1.4")  # 1.3 has a signal tower; 1.4 ends lines with a checksum, and times the pedal
 TOWER_LIGHTS = ("OFF", "GREEN", "YELLOW", "RED")
+_PEDAL = re.compile(r"\d{1,15}(?: \d{1,15} \d{1,15})?")
+_REFUSED = re.compile(r"refuses [^ ]+: (?P<why>\d.*)")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,12 +39,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="1.2 has no signal tower; before 1.4 lines have no checksum, and presses of the pedal no time",
     )  # fmt: skip
     parser.add_argument("--world", metavar="HOST:PORT", help="control socket of the rig that knows light and pedal")
+    add_replay(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
     """Serve until SIGTERM; each SIGUSR1 is one press of the pedal."""
     termination = Termination()
-    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, firmware=args.firmware)
+    made = Make(MODEL, SERIAL, args.firmware)
+    if args.replay:
+        made = _recorded(recorded_device(args.replay, "lightbox", args.replayed))
+    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, made)
 
     def press(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -46,11 +56,58 @@ def serve(args: argparse.Namespace) -> None:
 
     signal.signal(signal.SIGUSR1, press)
     try:
-        announce(port=box.plug_in(), link=None if args.link is None else str(args.link))
+        link = None if args.link is None else str(args.link)
+        announce(port=box.plug_in(), link=link, not_served=list(made.not_served))
         while not termination.is_set():
             box.serve_once(0.2)
     finally:
         box.unplug()
+
+
+@dataclass(frozen=True, slots=True)
+class Make:
+    """Holds identity and state of a box after power-up. Answers stand without the name of the quantity."""
+
+    model: str  # maker and model, with a comma between them
+    serial: str
+    firmware: str
+    answers: Mapping[str, str] = field(default_factory=dict[str, str])  # recorded ones; others are the simulator's
+    refusals: Mapping[str, str] = field(default_factory=dict[str, str])  # number and text of ERR; "": silence
+    not_served: tuple[str, ...] = ()
+
+    def has(self, major: int, minor: int) -> bool:
+        """Return whether its firmware is this one or later."""
+        numbers = self.firmware.split(".")
+        if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+            return False
+        return (int(numbers[0]), int(numbers[1])) >= (major, minor)
+
+
+def _recorded(device: RecordedDevice) -> Make:
+    """The box of a recording. Raises SimulatorError for a box without an identity."""
+    answers = device.exchanges
+    fields = [part.strip() for part in answers.pop("*IDN?", "").split(",")]
+    if len(fields) != 4:
+        raise SimulatorError(f"{device.name} stated no identity: there is nothing to serve")
+    maker, model, serial, firmware = fields
+    not_served: list[str] = []
+    if TAKEN_OUT.search(serial):
+        not_served.append(f"*IDN?, serial number: {serial}")
+        serial = SERIAL
+    known = ("LIGHT?", "TEMP?", "SHUTTER?", "PEDAL?")
+    not_served += [f"{question}: {answer}" for question, answer in answers.items() if question not in known]
+    refusals: dict[str, str] = {}
+    for silent in device.silent:
+        question, _, why = silent.partition(": ")
+        if question in known:
+            refused = _REFUSED.search(why)
+            refusals[question] = refused["why"] if refused else ""
+        else:
+            not_served.append(f"not recorded: {silent}")
+    heard = {question: answer for question, answer in answers.items() if question in known}
+    if "PEDAL?" in heard and not _PEDAL.fullmatch(heard["PEDAL?"]):
+        raise SimulatorError(f"the recorded answer to PEDAL? is {heard['PEDAL?']!r}: neither one number nor three")
+    return Make(f"{maker},{model}", serial, firmware, heard, refusals, tuple(not_served))
 
 
 class World:
@@ -82,23 +139,21 @@ class World:
 class Lightbox:
     """The state of the box and its end of the serial line."""
 
-    def __init__(
-        self, faults: FaultPlan, world: World | None, link: Path | None, *, firmware: str = FIRMWARES[-1]
-    ) -> None:
+    def __init__(self, faults: FaultPlan, world: World | None, link: Path | None, make: Make) -> None:
         self._faults = faults
         self._world = world
         self._line = Terminal(link)
         self._heard = b""
-        self._shutter = 0
-        self._on_since_s = time.monotonic()
-        self._pressed, self._pressed_ms = 0, 0  # by its own pedal; the last press, of the rig's pedal too
+        self._make = make
+        self._shutter = make.answers.get("SHUTTER?", "0")
+        count, *times = map(int, make.answers.get("PEDAL?", "0 0 0" if make.has(1, 4) else "0").split(" "))
+        self._times_presses = bool(times)
+        # By its own pedal; the last press, of the rig's pedal too.
+        self._pressed, self._pressed_ms = count, times[0] if times else 0
+        self._on_since_s = time.monotonic() - (seconds(times[1]) if times else 0.0)
         self._rig_pressed = 0
-        self._firmware = firmware
-        self._tower = None if firmware == "1.2" else "OFF"
-
-    @property
-    def _checks(self) -> bool:
-        return self._firmware == "1.4"
+        self._checks = make.has(1, 4)  # whether its lines end with a checksum
+        self._tower = "OFF" if make.has(1, 3) else None
 
     def _now_ms(self) -> int:
         return round(ms(time.monotonic() - self._on_since_s))
@@ -134,7 +189,10 @@ class Lightbox:
         else:
             wrong = False
         fault = self._faults.check("lightbox", request)
-        answer = self._line_of("ERR 4 wrong checksum" if wrong else self._answer(request))
+        said = "ERR 4 wrong checksum" if wrong else self._answer(request)
+        if not said:
+            return
+        answer = self._line_of(said)
         if fault is not None:
             log.info("fault %s at %s", fault.kind, request)
             if self._spoiled(fault, answer):
@@ -171,22 +229,28 @@ class Lightbox:
         return False
 
     def _answer(self, request: str) -> str:
+        """Return the reply to a request; "" where the box that was recorded was silent."""
+        if request in self._make.refusals:
+            why = self._make.refusals[request]
+            return why and f"ERR {why}"
         view = self._world.view() if self._world is not None else {}
+        light, warm = view.get("light_lux"), view.get("temperature_c")
+        recorded = self._make.answers
         readings = {
-            "*IDN?": f"*IDN {IDENTITY},{self._firmware}",
-            "LIGHT?": f"LIGHT {view.get('light_lux', 45_000.0):.1f}",
-            "TEMP?": f"TEMP {view.get('temperature_c', 21.5):.2f}",
+            "*IDN?": f"*IDN {self._make.model},{self._make.serial},{self._make.firmware}",
+            "LIGHT?": f"LIGHT {recorded.get('LIGHT?', '45000.0') if light is None else f'{light:.1f}'}",
+            "TEMP?": f"TEMP {recorded.get('TEMP?', '21.50') if warm is None else f'{warm:.2f}'}",
             "PEDAL?": self._pedal(view),
         }
         if request in ("SHUTTER 0", "SHUTTER 1"):
-            self._shutter = int(request[-1])
+            self._shutter = request[-1]
         if request in ("SHUTTER?", "SHUTTER 0", "SHUTTER 1"):
             return f"SHUTTER {self._shutter}"
-        word, _, light = request.partition(" ")
+        word, _, colour = request.partition(" ")
         if word in ("TOWER", "TOWER?") and self._tower is not None:
-            if word == "TOWER" and light not in TOWER_LIGHTS:
+            if word == "TOWER" and colour not in TOWER_LIGHTS:
                 return "ERR 2 wrong argument"
-            self._tower = light or self._tower
+            self._tower = colour or self._tower
             log.info("the tower shows %s", self._tower)
             return f"TOWER {self._tower}"
         wrong = "ERR 2 wrong argument" if request.startswith("SHUTTER") else "ERR 1 unknown request"
@@ -199,7 +263,7 @@ class Lightbox:
             ago_ms = round(ms(view.get("pedal_ago_s", 0.0)))
             self._rig_pressed, self._pressed_ms = of_rig, max(self._now_ms() - ago_ms, 1)
         count = f"PEDAL {self._pressed + of_rig}"
-        return f"{count} {self._pressed_ms} {self._now_ms()}" if self._checks else count
+        return f"{count} {self._pressed_ms} {self._now_ms()}" if self._times_presses else count
 
 
 def _checksum(line: str) -> str:

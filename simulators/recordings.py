@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -11,6 +12,8 @@ from typing import Any, cast
 from simulators.serve import SimulatorError
 
 _FORM, _VERSION = "orthocapture device recording", 1
+# What stands in a recording instead of personal data.
+TAKEN_OUT = re.compile(r"\((?:serial number|program|file|address|path|e-mail) \d+\)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,15 @@ class RecordedDevice:
     def exchanges(self) -> dict[str, str]:
         """The answer to each question."""
         return {one["question"]: one["answer"] for one in self.answers.get("exchanges", ())}
+
+    def lines(self, question: str) -> tuple[str, ...]:
+        """All lines with which a question was answered."""
+        return tuple(said["answer"] for said in self.answers.get("exchanges", ()) if said["question"] == question)
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """Return the questions that were asked in vain, each with the reason."""
+        return tuple(self.answers.get("silent", ()))
 
     def sample(self, source: str) -> dict[str, tuple[float, ...]]:
         """The numbers of a source that begins so; none if it was silent."""

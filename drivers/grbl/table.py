@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import time
 from collections import deque
+from collections.abc import Iterable
 from importlib.metadata import version
 from typing import NoReturn
 
@@ -25,7 +26,7 @@ from drivers.grbl.homing import home
 from drivers.grbl.link import Link
 from drivers.grbl.mover import Mover
 from drivers.grbl.setup import Setup, setup_of
-from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Message, Setting, Status
+from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Feedback, Message, Setting, Status
 from drivers.interfaces import (
     Array,
     DeviceAnswers,
@@ -60,6 +61,7 @@ class GrblTable:
         self._link: Link | None = None
         self._stream: PoseStream | None = None
         self._setup: Setup | None = None
+        self._told: tuple[Exchange, ...] = ()  # to `open`; kept where its settings did not suit
         self._arrived: deque[RobotSample] = deque()  # from the link's thread to the stream's
         self._before: RobotSample | None = None
 
@@ -72,12 +74,13 @@ class GrblTable:
         """
         self.close()
         self._arrived.clear()
-        self._before = None
+        self._before, self._told = None, ()
         self._link = link = Link(self._where, self._config, self._receive)
         try:
             link.reset(self._config.connect_timeout_s)
             settings = link.request(b"$$", self._config.answer_timeout_s)
             build = link.request(b"$I", self._config.answer_timeout_s)
+            self._told = (*_exchanges("$$", settings), *_exchanges("$I", build))
             self._setup = setup_of(settings, build, self._config.axes, self._where)
             self._mover.connect(link, self._setup)
             self._stream = PoseStream(
@@ -128,12 +131,15 @@ class GrblTable:
         )
 
     def answers(self) -> DeviceAnswers:
-        """Ask for settings and build, as `open` does, and tell the last status."""
+        """Ask for settings and build, as `open` does, and give the last status.
+
+        If `open` failed because of them, returns what the controller answered then.
+        """
+        if self._link is None and self._told:
+            return DeviceAnswers(exchanges=self._told)
         link, exchanges = self._linked(), list[Exchange]()
         for question in ("$$", "$I"):
-            for one in link.request(question.encode(), self._config.answer_timeout_s):
-                answer = f"${one.number}={one.value:g}" if isinstance(one, Setting) else f"[{one.text}]"
-                exchanges.append(Exchange(question=question, answer=answer))
+            exchanges += _exchanges(question, link.request(question.encode(), self._config.answer_timeout_s))
         if (status := self._mover.status) is not None:
             exchanges.append(Exchange(question="?", answer=status.state))
         return DeviceAnswers(exchanges=tuple(exchanges))
@@ -368,3 +374,9 @@ class GrblTable:
             what = f"the axes need {len(self._config.axes)} finite numbers, not {values}"
             raise DeviceRefusedError(what, where=self._where, remedy="Choose another viewpoint")
         return out
+
+
+def _exchanges(question: str, answers: Iterable[Setting | Feedback]) -> list[Exchange]:
+    """The lines of an answer, each with its question."""
+    lines = (f"${a.number}={a.value:.12g}" if isinstance(a, Setting) else f"[{a.text}]" for a in answers)
+    return [Exchange(question=question, answer=line) for line in lines]

@@ -12,15 +12,15 @@ from simulators.canon_camera.properties import (
     ONE_SHOT,
     Code,
     Properties,
+    eos_r5,
 )
+from simulators.canon_camera.recorded import Table
 from simulators.faults import FaultPlan
 from simulators.still_camera.body import BodyOptions, CameraBody, CameraFile, FileNames
 from simulators.still_camera.card import FOLDER_PICTURES, STORAGE
 from simulators.still_camera.exif import ExposureSettings, Nameplate
 from simulators.still_camera.scene import ImageSource
 
-MODEL, SERIAL, LENS = "Canon EOS R5", "042021006092", "RF24-70mm F2.8 L IS USM"
-PLATE = Nameplate("Canon", MODEL, LENS, SERIAL, "Firmware Version 1.8.2", sub_second_digits=2)
 FORMAT_CR3 = 0xB108
 PICTURE_BYTES = 30_000_000  # by which the remaining pictures are counted
 _IN_MEMORY = 0x40000000
@@ -30,12 +30,20 @@ DIALLED = {Code.APERTURE: 0x50, Code.SHUTTER: 0x58, Code.ISO: 0x48}
 
 
 class CanonBody(CameraBody):
-    """An EOS R5, whose files stay on its card."""
+    """An EOS R5 or a body that was recorded, whose files stay on its card."""
 
-    def __init__(self, source: ImageSource, faults: FaultPlan, options: BodyOptions) -> None:
-        super().__init__(source, faults, options, PLATE, FileNames("IMG_{:04d}", ".CR3", FORMAT_CR3))
-        self.properties = Properties(SERIAL, LENS)
-        self.count_shots()
+    def __init__(
+        self, source: ImageSource, faults: FaultPlan, options: BodyOptions, recorded: Table | None = None
+    ) -> None:
+        self.table = table = recorded or eos_r5()
+        version = f"Firmware Version {table.firmware.rpartition('-')[2]}"
+        plate = Nameplate("Canon", table.model, table.lens, table.serial, version, sub_second_digits=2)
+        super().__init__(source, faults, options, plate, FileNames("IMG_{:04d}", ".CR3", FORMAT_CR3))
+        self.properties = Properties(table)
+        if table.free_bytes is not None:
+            self.free_bytes = table.free_bytes
+        if recorded is None:
+            self.count_shots()
         self.has_card = True
         self.focus_steps = 0  # by which the lens was driven; away from the camera counts up
         self._files: dict[int, CameraFile] = {}

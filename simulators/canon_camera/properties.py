@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 
 from simulators.canon_camera import events
+from simulators.canon_camera.formats import FORMATS, JPEG, JPEG_LARGE_NORMAL, RAW_FILE
+from simulators.canon_camera.recorded import LENS, SERIAL, Formats, Number, Table
 from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.operations import NotWritableError, RefusedValueError
 
@@ -40,6 +40,9 @@ MANUAL_FOCUS, ONE_SHOT = 3, 0
 MANUAL_EXPOSURE, APERTURE_PRIORITY = 3, 2
 _BATTERY = ((87, 2), (62, 4), (37, 1), (12, 5))  # at least so many per cent: code
 _NEARLY_EMPTY = 0
+_PER_STOP = 8  # steps of the codes of exposure times; f-numbers have twice as many for a factor of two
+_ONE_SECOND, _F_1 = 0x38, 0x08
+_APERTURE_CODES = range(_F_1, 0x71)
 
 
 def thirds(first: int, count: int) -> tuple[int, ...]:
@@ -73,58 +76,43 @@ _ABOVE_ZERO = thirds(0, 10)[:0:-1]
 COMPENSATIONS = (*_ABOVE_ZERO, 0, *((-code) & 0xFF for code in reversed(_ABOVE_ZERO)))
 
 
-@dataclass(frozen=True, slots=True)
-class ImageFormat:
-    """The files of an exposure: (type, size, compression) of one or two of them."""
-
-    parts: tuple[tuple[int, int, int], ...]
-
-    def encode(self) -> bytes:
-        """Count, then for each file the size of its entry and the three numbers."""
-        return struct.pack("<I", len(self.parts)) + b"".join(struct.pack("<IIII", 16, *part) for part in self.parts)
-
-
-JPEG_LARGE, JPEG_LARGE_NORMAL, RAW = (1, 0, 3), (1, 0, 2), (6, 0, 4)
-_COMBINATIONS = ((JPEG_LARGE,), (JPEG_LARGE_NORMAL,), (RAW, JPEG_LARGE), (RAW, JPEG_LARGE_NORMAL), (RAW,))
-FORMATS = tuple(ImageFormat(parts) for parts in _COMBINATIONS)
-
-
-@dataclass(slots=True)
-class _Number:
-    value: int
-    choices: tuple[int, ...] = ()
-    writable: bool = True
-
-
-def _initial() -> dict[Code, _Number]:
+def eos_r5() -> Table:
     """After power-on, with the dial on M: f/8, 1/60 s, ISO 400, daylight, files to the card."""
-    return {
-        Code.APERTURE: _Number(0x38, tuple(APERTURE_F)),
-        Code.SHUTTER: _Number(0x68, tuple(SHUTTER)),
-        Code.ISO: _Number(0x58, (0, *ISO)),
-        Code.EXPOSURE_COMPENSATION: _Number(0, COMPENSATIONS),
-        Code.EXPOSURE_MODE: _Number(MANUAL_EXPOSURE, writable=False),
-        Code.DRIVE: _Number(0, (0, 0x12, 0x04, 0x05, 0x10, 0x11)),
-        Code.FOCUS: _Number(MANUAL_FOCUS, (0, 1), writable=False),
-        Code.WHITE_BALANCE: _Number(1, (0, 23, 1, 8, 2, 3, 4, 5, 6, 9)),
-        Code.BATTERY: _Number(2, writable=False),
-        Code.AVAILABLE_SHOTS: _Number(0, writable=False),
-        Code.DESTINATION: _Number(CARD, (CARD, MEMORY)),
-        Code.STORAGE: _Number(0x00010001, writable=False),
-        Code.VIEWFINDER_OUTPUT: _Number(1, (0, 1, 2, 3)),
-        Code.VIEWFINDER_MODE: _Number(1, (0, 1)),
+    entries: dict[int, Number | Formats | str] = {
+        Code.APERTURE: Number(0x38, tuple(APERTURE_F)),
+        Code.SHUTTER: Number(0x68, tuple(SHUTTER)),
+        Code.ISO: Number(0x58, (0, *ISO)),
+        Code.EXPOSURE_COMPENSATION: Number(0, COMPENSATIONS),
+        Code.EXPOSURE_MODE: Number(MANUAL_EXPOSURE, writable=False),
+        Code.DRIVE: Number(0, (0, 0x12, 0x04, 0x05, 0x10, 0x11)),
+        Code.FOCUS: Number(MANUAL_FOCUS, (0, 1), writable=False),
+        Code.WHITE_BALANCE: Number(1, (0, 23, 1, 8, 2, 3, 4, 5, 6, 9)),
+        Code.BATTERY: Number(2, writable=False),
+        Code.AVAILABLE_SHOTS: Number(0, writable=False),
+        Code.DESTINATION: Number(CARD, (CARD, MEMORY)),
+        Code.STORAGE: Number(0x00010001, writable=False),
+        Code.VIEWFINDER_OUTPUT: Number(1, (0, 1, 2, 3)),
+        Code.VIEWFINDER_MODE: Number(1, (0, 1)),
+        Code.IMAGE_FORMAT: Formats(),
+        Code.SERIAL: SERIAL,
+        Code.LENS: LENS,
     }
+    return Table(entries)
 
 
 class Properties:
     """All properties and the event records that tell of them; used by several threads."""
 
-    def __init__(self, serial: str, lens: str) -> None:
-        self._numbers = _initial()
-        self._format = FORMATS[0]
-        self._texts = {Code.SERIAL: serial, Code.LENS: lens}
+    def __init__(self, table: Table) -> None:
+        self._entries = dict(table.entries)
+        self._unstated = eos_r5().entries  # of a body that does not state what an exposure needs
         self._lock = threading.Lock()
         self._news = bytearray()
+
+    @property
+    def codes(self) -> tuple[int, ...]:
+        """The codes of all properties, in the body's order."""
+        return tuple(self._entries)
 
     def announce(self, record: bytes) -> None:
         """Add a record to the next answer to GetEvent."""
@@ -140,69 +128,69 @@ class Properties:
     def announce_all(self) -> None:
         """Tell values and choices of everything, as at the beginning of remote control."""
         with self._lock:
-            for code, entry in self._numbers.items():
+            for code, entry in self._entries.items():
                 self._news += self._value_of(code)
-                if entry.choices:
+                if isinstance(entry, str) or not entry.choices:
+                    continue
+                if isinstance(entry, Number):
                     packed = struct.pack(f"<{len(entry.choices)}I", *entry.choices)
-                    self._news += events.choices(code, len(entry.choices), packed)
-            self._news += self._value_of(Code.IMAGE_FORMAT)
-            listing = b"".join(one.encode() for one in FORMATS)
-            self._news += events.choices(Code.IMAGE_FORMAT, len(FORMATS), listing)
-            for code in self._texts:
-                self._news += self._value_of(code)
+                else:
+                    packed = b"".join(choice.encode() for choice in entry.choices)
+                self._news += events.choices(code, len(entry.choices), packed)
 
-    def _value_of(self, code: Code) -> bytes:
-        if code in self._texts:
-            return events.value(code, self._texts[code].encode("ascii") + b"\0")
-        if code is Code.IMAGE_FORMAT:
-            return events.value(code, self._format.encode())
-        return events.value(code, struct.pack("<I", self._numbers[code].value))
+    def _value_of(self, code: int) -> bytes:
+        entry = self._entries[code]
+        if isinstance(entry, str):
+            return events.value(code, entry.encode("ascii", "replace") + b"\0")
+        if isinstance(entry, Formats):
+            return events.value(code, entry.value.encode())
+        return events.value(code, struct.pack("<I", entry.value))
 
     def tell(self, number: int) -> None:
         """Tell the value of one property again. Raises NotWritableError if there is none."""
+        if number not in self._entries:
+            raise NotWritableError(f"{number:04X}")
         with self._lock:
-            self._news += self._value_of(self._code_of(number))
-
-    def _code_of(self, number: int) -> Code:
-        try:
-            return Code(number)
-        except ValueError as error:
-            raise NotWritableError(f"{number:04X}") from error
+            self._news += self._value_of(number)
 
     def set_from_client(self, data: bytes) -> None:
         """Set a value: size, code, value. Raises NotWritableError or RefusedValueError."""
         if len(data) < 12 or struct.unpack_from("<I", data)[0] != len(data):
             raise RefusedValueError(f"{len(data)} bytes are not a value")
-        code = self._code_of(struct.unpack_from("<I", data, 4)[0])
-        if code is Code.IMAGE_FORMAT:
-            chosen = next((one for one in FORMATS if one.encode() == data[8:]), None)
+        code = int(struct.unpack_from("<I", data, 4)[0])
+        entry = self._entries.get(code)
+        if isinstance(entry, Formats) and entry.writable:
+            chosen = next((choice for choice in entry.choices if choice.encode() == data[8:]), None)
             if chosen is None:
                 raise RefusedValueError("no such image format")
-            self._format = chosen
+            entry.value = chosen
         else:
             self._accept(code, int(struct.unpack_from("<I", data, 8)[0]))
         self.tell(code)
 
-    def _accept(self, code: Code, value: int) -> None:
-        entry = self._numbers.get(code)
-        if entry is None or not entry.writable:
-            raise NotWritableError(code.name)
+    def _accept(self, code: int, value: int) -> None:
+        entry = self._entries.get(code)
+        if not isinstance(entry, Number) or not entry.writable:
+            raise NotWritableError(f"{code:04X}")
         if entry.choices and value not in entry.choices:
-            raise RefusedValueError(f"{code.name} does not offer {value}")
-        exposure = code in (Code.APERTURE, Code.SHUTTER)
-        if exposure and self._numbers[Code.EXPOSURE_MODE].value != MANUAL_EXPOSURE:
-            raise NotWritableError(f"{code.name}: the mode dial is not on M")
+            raise RefusedValueError(f"{code:04X} does not offer {value}")
+        if code in (Code.APERTURE, Code.SHUTTER) and self.value(Code.EXPOSURE_MODE) != MANUAL_EXPOSURE:
+            raise NotWritableError(f"{code:04X}: the mode dial is not on M")
         entry.value = value
 
     def put(self, code: Code, value: int) -> None:
-        """Change a value from inside the camera, and tell it."""
+        """Change a value from inside the camera, and announce it if this body states it."""
         with self._lock:
-            self._numbers[code].value = value
-            self._news += self._value_of(code)
+            entry = self._entries.get(code)
+            if isinstance(entry, Number):
+                entry.value = value
+                self._news += self._value_of(code)
 
     def offer(self, code: Code, choices: tuple[int, ...]) -> None:
         """Offer only these values from now on, and take the first of them."""
-        self._numbers[code].choices = choices
+        entry = self._entries.get(code)
+        if isinstance(entry, Number):
+            entry.choices = choices
         self.put(code, choices[0])
 
     def charge(self, percent: int) -> None:
@@ -210,22 +198,35 @@ class Properties:
         self.put(Code.BATTERY, next((code for least, code in _BATTERY if percent >= least), _NEARLY_EMPTY))
 
     def value(self, code: Code) -> int:
-        """The current number."""
+        """The current number; the simulated EOS R5's if this body does not state it."""
         with self._lock:
-            return self._numbers[code].value
+            entry = self._entries.get(code, self._unstated[code])
+        assert isinstance(entry, Number)
+        return entry.value
 
     def exposure_settings(self) -> ExposureSettings:
         """The settings with which the next exposure will be taken."""
-        fraction = SHUTTER[self.value(Code.SHUTTER)]
-        kinds: Sequence[tuple[int, int, int]] = self._format.parts
-        jpeg = next((part for part in kinds if part[0] == JPEG_LARGE[0]), None)
+        aperture, shutter, iso = (self.value(code) for code in (Code.APERTURE, Code.SHUTTER, Code.ISO))
+        fraction = SHUTTER.get(shutter) or _fraction(2.0 ** ((_ONE_SECOND - shutter) / _PER_STOP))
+        formats = self._entries.get(Code.IMAGE_FORMAT)
+        kinds = formats.value.parts if isinstance(formats, Formats) else FORMATS[0].parts
+        jpeg = next((part for part in kinds if part[0] == JPEG), None)
+        stated = aperture in _APERTURE_CODES  # otherwise there is no lens that states one
+        f_number = 2.0 ** ((aperture - _F_1) / (2 * _PER_STOP)) if stated else 8.0
         return ExposureSettings(
-            aperture_f=APERTURE_F[self.value(Code.APERTURE)],
+            aperture_f=APERTURE_F.get(aperture, f_number),
             exposure_s=fraction[0] / fraction[1],
             exposure_fraction=fraction,
-            iso=ISO.get(self.value(Code.ISO), 400),
+            iso=ISO.get(iso, 400),
             jpeg=jpeg is not None,
-            raw=RAW in kinds,
+            raw=any(part[0] == RAW_FILE for part in kinds),
             jpeg_level=3 if jpeg == JPEG_LARGE_NORMAL else 1,
-            on_card=self.value(Code.DESTINATION) == CARD,
+            on_card=self.value(Code.DESTINATION) != MEMORY,
+            states_aperture=stated,
         )
+
+
+def _fraction(exposure_s: float) -> tuple[int, int]:
+    """A time as a body writes it: 1/n, or tenths of a second."""
+    within_s = min(max(exposure_s, 1 / 32000), 30.0)
+    return (1, round(1 / within_s)) if within_s < 1 / 4 else (round(10 * within_s), 10)

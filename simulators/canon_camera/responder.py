@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from simulators.canon_camera.body import FORMAT_CR3, MODEL, CanonBody
+from simulators.canon_camera.body import FORMAT_CR3, CanonBody
 from simulators.canon_camera.events import Event
 from simulators.canon_camera.properties import MEMORY, Code
 from simulators.faults import FaultPlan
@@ -80,12 +80,12 @@ class CanonResponder(Operations):
         del request, data
         info = codec.DeviceInfo(
             manufacturer="Canon.Inc",
-            model=MODEL,
-            firmware="3-1.8.2",
+            model=self._body.table.model,
+            firmware=self._body.table.firmware,
             serial="3f0c1b8e5d2a4c6791e0a2b4c6d8e0f1",
             operations=tuple(self.operations),
             events=(0x4009, 0xC101),
-            properties=(0xD402, 0xD407),
+            properties=self._body.table.controls,
             image_formats=(_ASSOCIATION, FORMAT_JPEG, FORMAT_CR3),
             vendor_extension=VENDOR,
             vendor_description="",
@@ -94,7 +94,9 @@ class CanonResponder(Operations):
 
     def _eos_device_info(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
-        arrays = b"".join(codec.array_u32(values) for values in (tuple(Event), tuple(Code), (STORAGE,)))
+        arrays = b"".join(
+            codec.array_u32(values) for values in (tuple(Event), self._body.properties.codes, (STORAGE,))
+        )
         return Reply(data=struct.pack("<I", 4 + len(arrays)) + arrays)
 
     def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
@@ -144,7 +146,7 @@ class CanonResponder(Operations):
     def _tell(self, request: codec.Request, data: bytes) -> Reply:
         del data
         number = request.parameters[0] if request.parameters else 0
-        if number not in tuple(Code):
+        if number not in self._body.properties.codes:
             return Reply(GENERAL_ERROR)
         self._body.properties.tell(number)
         return Reply()

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from simulators.grbl.carrier import Carrier
-from simulators.grbl.controller import Controller
+from simulators.grbl.controller import SIMULATED, Controller
 from simulators.grbl.machine import Machine
+from simulators.grbl.replay import recorded
+from simulators.recordings import add_replay, recorded_device
 from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
 from simulators.world_link import WorldLink
@@ -27,12 +30,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--distance-m", type=float, default=0.62, help="from the camera to the scene's centre")
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="motions take 1/N of their time")
     parser.add_argument("--setting", nargs="+", default=[], metavar="N=VALUE", help="settings such as 22=0")
+    add_replay(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
     """Serve until SIGTERM."""
     termination = Termination()
-    machine = Machine(_settings(args.setting), args.speed_up)
+    said, settings = SIMULATED, dict[int, float]()
+    if args.replay:
+        said, settings = recorded(recorded_device(args.replay, "grbl", args.replayed))
+    given = _settings(args.setting)
+    said = replace(said, listed=tuple({*said.listed, *given}))
+    machine = Machine(settings | given, args.speed_up)
     carrier = Carrier(args.tilt_deg, args.distance_m)
     world = None
     if args.world:
@@ -41,11 +50,12 @@ def serve(args: argparse.Namespace) -> None:
             raise SimulatorError(f"--world wants HOST:PORT, not {args.world!r}")
         world = WorldLink((host, int(port)), "table")
     terminal = Terminal(args.link)
-    controller = Controller(machine, terminal.send, args.faults)
+    controller = Controller(machine, terminal.send, args.faults, said)
     try:
         port_name = terminal.plug_in()
         controller.power_up()
-        announce(port=port_name, link=None if args.link is None else str(args.link))
+        link = None if args.link is None else str(args.link)
+        announce(port=port_name, link=link, not_served=list(said.not_served))
         while not termination.is_set():
             controller.hear(terminal.receive(_TICK_S))
             now_s = time.monotonic()

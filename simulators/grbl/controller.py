@@ -11,11 +11,12 @@ import numpy as np
 
 from simulators.faults import Fault, FaultPlan
 from simulators.geometry import Array
-from simulators.grbl.machine import AXES, PLANNER_BLOCKS, Block, Machine
+from simulators.grbl.machine import AXES, FACTORY, PLANNER_BLOCKS, Block, Machine
+from simulators.grbl.replay import OWN_NAME, Said
 
 log = logging.getLogger(__name__)
 
-VERSION, BUILD = "1.1h", "1.1h.20190825"
+SIMULATED = Said("1.1h", (f"[VER:1.1h.20190825:{OWN_NAME}]", "[OPT:V,15,128]"), tuple(FACTORY))
 _WORD = re.compile(r"([A-Z])(-?\d*\.?\d+)")
 _REALTIME = (0x18, 0x3F, 0x21, 0x7E, 0x85)  # reset, ?, !, ~, jog cancel
 _PIN_FAULTS = ("hard_limit", "reset_button", "door", "hold_button")
@@ -28,9 +29,13 @@ class Controller:
         machine: the machine that it drives.
         send: sends bytes to the host.
         faults: which messages fail; the device is `grbl`, messages are `?`, `jog`, or the line itself.
+        said: settings that it lists, version and build.
     """
 
-    def __init__(self, machine: Machine, send: Callable[[bytes], None], faults: FaultPlan) -> None:
+    def __init__(
+        self, machine: Machine, send: Callable[[bytes], None], faults: FaultPlan, said: Said = SIMULATED
+    ) -> None:
+        self._said = said
         self._machine, self._send, self._faults = machine, send, faults
         self._state = "Alarm"
         self._heard = b""
@@ -47,7 +52,7 @@ class Controller:
         """Start as after power-up: locked if homing is enabled, since nobody knows where the axes are."""
         self._machine.halt()
         self.unplugged_s = 0.0
-        self._start_anew("Alarm" if self._machine.settings[22] else "Idle")
+        self._start_anew(self._said.state or ("Alarm" if self._machine.settings[22] else "Idle"))
 
     # --- the line ----------------------------------------------------------------------------------------
 
@@ -130,7 +135,7 @@ class Controller:
     def _start_anew(self, state: str) -> None:
         self._state, self._waits_for_reset, self._asked, self._reports = state, False, False, 0
         self._say("")
-        self._say(f"Grbl {VERSION} ['$' for help]")
+        self._say(f"Grbl {self._said.version} ['$' for help]")
         if state == "Alarm":
             self._say("[MSG:'$H'|'$X' to unlock]")
 
@@ -194,14 +199,15 @@ class Controller:
             return
         match line:
             case "$$":
-                for number, value in sorted(self._machine.settings.items()):
+                for number in sorted(self._said.listed):
+                    value = self._machine.settings[number]
                     self._say(
-                        f"${number}={value:.3f}" if number in (11, 12) or number > 99 else f"${number}={value:g}"
+                        f"${number}={value:.3f}" if number in (11, 12) or number > 99 else f"${number}={value:.12g}"
                     )
                 self._say("ok")
             case "$I":
-                self._say(f"[VER:{BUILD}:simulated table]")
-                self._say("[OPT:V,15,128]")
+                for line_of_build in self._said.build:
+                    self._say(line_of_build)
                 self._say("ok")
             case "$X":
                 if self._state == "Alarm":

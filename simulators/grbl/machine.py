@@ -12,7 +12,7 @@ from simulators.geometry import Array
 
 AXES = 3
 PLANNER_BLOCKS = 15
-_FACTORY: Mapping[int, float] = {
+FACTORY: Mapping[int, float] = {
     0: 10, 1: 255, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 10: 1, 11: 0.01, 12: 0.002, 13: 0,
     20: 1, 21: 1, 22: 1, 23: 0, 24: 120, 25: 3600, 26: 250, 27: 1, 30: 1000, 31: 0, 32: 0,
     100: 80, 101: 200, 102: 200, 110: 3600, 111: 3000, 112: 3000, 120: 60, 121: 300, 122: 300,
@@ -33,10 +33,10 @@ class Machine:
     """Three axes, in degrees or millimetres from their switches; `origin` is what the controller takes for 0."""
 
     def __init__(self, settings: Mapping[int, float], speed_up: float) -> None:
-        self.settings = dict(_FACTORY) | dict(settings)
+        self.settings = dict(FACTORY) | dict(settings)
         self._speed_up = speed_up
-        self._true = _POWER_UP.copy()
-        self._origin = _POWER_UP.copy()  # without homing, 0 is where it stood at power-up
+        self._true = np.maximum(_POWER_UP, -0.5 * np.abs(self.per_axis(130)))  # within the travel of a small machine
+        self._origin = self._true.copy()  # without homing, 0 is where it stood at power-up
         self.work_offset = np.array([-12.5, 7.0, 0.0])  # of G54, as somebody left it
         self.blocks: deque[Block] = deque()
         self._speed = 0.0  # along the path, units a second

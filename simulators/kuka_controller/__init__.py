@@ -10,7 +10,9 @@ import numpy as np
 from simulators.kuka_controller.controller import HEARTBEAT_S, MODES, Controller
 from simulators.kuka_controller.fri import VERSIONS
 from simulators.kuka_controller.kinematics import MODELS, Array
+from simulators.kuka_controller.replay import recorded
 from simulators.kuka_controller.server import Server
+from simulators.recordings import add_replay, recorded_device
 from simulators.serve import SimulatorError, Termination, add_patience, announce
 from simulators.world_link import WorldLink
 
@@ -35,16 +37,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that receives the joints")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
+    add_replay(parser)
     add_patience(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
     """Listen, print the ready line and serve until SIGTERM. Raises SimulatorError."""
     termination = Termination()
+    replayed = recorded(recorded_device(args.replay, "kuka_sunrise", args.replayed)) if args.replay else None
+    as_recorded = None if replayed is None or args.initial_joints else replayed.joints
     controller = Controller(
-        MODELS[args.model],
-        joints=_joints(args.initial_joints),
-        serial=args.serial or f"simulated {args.host}",
+        replayed.model if replayed else MODELS[args.model],
+        joints=_joints(args.initial_joints) if as_recorded is None else as_recorded,
+        serial=args.serial or (replayed.serial if replayed else "") or f"simulated {args.host}",
         faults=args.faults,
         device=args.arm,
         speed_up=args.speed_up,
@@ -52,6 +57,8 @@ def serve(args: argparse.Namespace) -> None:
         true_load_kg=args.true_load_kg,
     )
     controller.mode = args.mode
+    if replayed:
+        replayed.set_up(controller)
     world = None
     if args.world:
         host, _, port = args.world.rpartition(":")
@@ -61,9 +68,10 @@ def serve(args: argparse.Namespace) -> None:
         host=args.host,
         application=f"{args.host}:{args.port}",
         pendant=f"{args.host}:{args.pendant_port}",
-        model=args.model,
+        model=controller.model.name,
         serial=controller.serial,
         pid=os.getpid(),
+        not_served=list(replayed.not_served) if replayed else [],
     )
     try:
         server.run(termination)

@@ -92,7 +92,8 @@ class Controller:
         self.speed_up, self.true_load_kg, self.heartbeat_s = speed_up, true_load_kg, heartbeat_s
         self.time_s = 0.0
         self.mode, self.safety, self.locked = "AUT", "normal", True
-        self.override = 1.0
+        self.ready, self.override = True, 1.0
+        self.software = "Sunrise.OS simulated"
         self.q = joints.copy()
         self.tool: dict[str, object] = {
             "mass_kg": 0.0, "centre_m": [0.0] * 3, "tcp_xyz_m": [0.0] * 3, "tcp_abc_rad": [0.0] * 3,
@@ -131,6 +132,8 @@ class Controller:
     def move(self, goal: Array, speed: float, acceleration: float) -> int:
         """Start a motion and return its number. Raises RefusedError."""
         self._refuse_in_stop()
+        if not self.ready:
+            raise RefusedError("not_ready", "the arm is not ready to move")
         if self.locked:
             raise RefusedError("locked", "nobody has permitted motion")
         if self.motion is not None:
@@ -235,6 +238,6 @@ class Controller:
         return {
             "is": "state", "n": number, "time_s": round(self.time_s, 6), "q": joints, "q_command": joints,
             "flange_xyz_m": [float(v) for v in T[:3, 3]], "flange_abc_rad": list(kinematics.to_abc(T[:3, :3])),
-            "mode": self.mode, "safety": self.safety, "ready": True, "locked": self.locked,
+            "mode": self.mode, "safety": self.safety, "ready": self.ready, "locked": self.locked,
             "motion": self.motion.number if self.motion is not None else 0, "override": self.override,
         }  # fmt: skip

@@ -150,7 +150,7 @@ class Server:
             client.tell(
                 {
                     "is": "hello", "protocol": 1, "model": self.controller.model.name,
-                    "serial": self.controller.serial, "software": "Sunrise.OS simulated",
+                    "serial": self.controller.serial, "software": self.controller.software,
                     "time_s": round(self.controller.time_s, 6),
                 }
             )  # fmt: skip

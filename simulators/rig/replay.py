@@ -10,7 +10,7 @@ from simulators.scene.world import ARMS
 from simulators.serve import SimulatorError
 from simulators.ur_controller.replay import recorded
 
-_BODIES = {"Sony": "camera", "Nikon": "nikon"}  # makers of bodies, and their simulators
+_BODIES = {"Sony": "camera", "Nikon": "nikon", "Canon": "canon"}  # makers of bodies, and their simulators
 _MOST_ARMS = 2
 
 

@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from simulators.recordings import RecordedDevice
+from simulators.recordings import TAKEN_OUT, RecordedDevice
 from simulators.serve import SimulatorError
 from simulators.ur_controller import fields, kinematics
 from simulators.ur_controller.controller import Controller
@@ -20,7 +20,6 @@ from simulators.ur_controller.program import Interpreter
 
 _VERSION = re.compile(r"([0-9]{1,3})\.([0-9]{1,3})")
 _OF_THE_PROGRAM = ("running", "programstate", "get loaded program")
-_TAKEN_OUT = re.compile(r"\((?:serial number|program|file|address|path|e-mail) \d+\)")  # as recordings say it
 _NO_TOOL_M = 1e-9
 _SET = ("actual_q", "robot_mode", "safety_status_bits", "target_speed_fraction", "payload", "payload_cog")
 
@@ -56,7 +55,7 @@ class Recorded:
         return {
             (question.lower(), own.answer(question)): answer
             for question, answer in self.answers.items()
-            if question.lower() not in _OF_THE_PROGRAM and not _TAKEN_OUT.search(answer)
+            if question.lower() not in _OF_THE_PROGRAM and not TAKEN_OUT.search(answer)
         }
 
     @property
@@ -65,7 +64,7 @@ class Recorded:
         own = [
             f"dashboard, {question}: {answer}"
             for question, answer in self.answers.items()
-            if question.lower() in _OF_THE_PROGRAM or _TAKEN_OUT.search(answer)
+            if question.lower() in _OF_THE_PROGRAM or TAKEN_OUT.search(answer)
         ]
         own += [f"RTDE, {name}" for name in self.sample if name not in (*_SET, "actual_TCP_pose")]
         return (*own, *(f"not recorded: {why}" for why in self.silent))
@@ -73,7 +72,7 @@ class Recorded:
 
 def recorded(device: RecordedDevice) -> Recorded:
     """Read what a controller said. Raises SimulatorError for one of which no simulator can be made."""
-    answers, silent = device.exchanges, tuple(device.answers.get("silent", ()))
+    answers = device.exchanges
     stated = _VERSION.search(answers.get("PolyscopeVersion", ""))
     if stated is None:
         raise SimulatorError(f"{device.name} did not tell its version: there is nothing to serve")
@@ -87,7 +86,7 @@ def recorded(device: RecordedDevice) -> Recorded:
         model = replace(model, **{field: cast(Six, values) for field, values in own.items()})
     sample = device.sample("RTDE")
     joints = np.array(sample["actual_q"]) if "actual_q" in sample else None
-    return Recorded(model, version, joints, answers, sample, silent)
+    return Recorded(model, version, joints, answers, sample, device.silent)
 
 
 def _fits(model: str, version: fields.Version) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from simulators.canon_camera import events
 from simulators.canon_camera.body import CanonBody
-from simulators.canon_camera.properties import APERTURE_F, FORMATS, ISO, SHUTTER, Code, Properties
+from simulators.canon_camera.properties import APERTURE_F, FORMATS, ISO, SHUTTER, Code, Properties, eos_r5
 from simulators.canon_camera.responder import CanonResponder
 from simulators.faults import FaultPlan
 from simulators.ptpip import codec
@@ -73,7 +73,7 @@ def written(code: Code, value: int) -> bytes:
 
 
 def test_a_value_that_is_set_is_told_and_a_refused_one_is_not() -> None:
-    table = Properties("1", "lens")
+    table = Properties(eos_r5())
     table.set_from_client(written(Code.ISO, 0x48))
     assert table.news().hex() == "10000000" + "89c10000" + "03d10000" + "48000000" + events.END.hex()
     with pytest.raises(RefusedValueError):
@@ -87,7 +87,7 @@ def test_a_value_that_is_set_is_told_and_a_refused_one_is_not() -> None:
 
 
 def test_the_mode_dial_locks_aperture_and_time() -> None:
-    table = Properties("1", "lens")
+    table = Properties(eos_r5())
     table.put(Code.EXPOSURE_MODE, 2)
     with pytest.raises(NotWritableError, match="mode dial"):
         table.set_from_client(written(Code.APERTURE, 0x50))

@@ -315,6 +315,18 @@ RUN_ELSEWHERE = {
     "orthocapture simulate nikon --replay devices.json": (
         "tests/recording/test_round_trips.py::test_a_body_is_the_same_on_the_replay_of_its_recording"
     ),
+    "orthocapture simulate canon --replay devices.json": (
+        "tests/recording/test_replayed_canon.py::test_a_canon_is_the_same_on_the_replay_of_what_the_doctor_recorded"
+    ),
+    "orthocapture simulate kuka --replay devices.json": (
+        "tests/recording/test_replayed_machines.py::test_a_kuka_is_the_same_on_the_replay_of_its_recording"
+    ),
+    "orthocapture simulate grbl --replay devices.json": (
+        "tests/recording/test_replayed_machines.py::test_a_grbl_machine_is_the_same_on_the_replay_of_its_recording"
+    ),
+    "orthocapture simulate lightbox --replay devices.json": (
+        "tests/recording/test_replayed_machines.py::test_a_light_box_is_the_same_on_the_replay_of_its_recording"
+    ),
     "orthocapture simulate ur --replay devices.json": (
         "tests/recording/test_round_trips.py::test_an_arm_is_the_same_on_the_replay_of_its_recording"
     ),
