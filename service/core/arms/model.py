@@ -169,16 +169,11 @@ GROUP = "orthocapture.arms"
 
 @cache
 def known_arms() -> tuple[ArmModel, ...]:
-    """Return all arms, by name of their row: those of the two tables, and those of other packages' entry points.
-
-    An installation from when each arm of ours had a module still lists these; the tables stand for them.
-    """
+    """Return all arms, by name of their row: those of the two tables, and those of other packages' entry points."""
     from service.core.arms import kuka, universal_robots  # noqa: PLC0415 - their rows are models
 
     found: dict[str, ArmModel] = {**kuka.ARMS, **universal_robots.ARMS}
     for point in plug_ins(GROUP):
-        if point.module.startswith(f"{__package__}."):
-            continue
         arm: object = point.load()
         if not isinstance(arm, ArmModel):
             raise ConfigurationError(
