@@ -2,7 +2,7 @@
 
 Run: python -m bench.ground_truth.fusion [--scenes 7 …] [--voxel-mm 0.4] [--spacing-mm 0.5] [--half] [--out NAME]
 
-`bench.ground_truth.seam` says how the step at the seam is measured. The same is measured in the scan's own part,
+`tests.support.scenes.seam` says how the step at the seam is measured. The same is measured in the scan's own part,
 where there is no seam: what is found there is noise.
 """
 
@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.ground_truth.seam import no_seam, seam, steps, strips
 from bench.machine import RESULTS, commit, machine
 from service.compute.ground_truth.distances import PointIndex, TriangleTree
 from service.compute.ground_truth.fuse import FusionSettings, Source, fuse
@@ -29,6 +28,7 @@ from service.core.units import metres, mm
 from simulators.ct_suite.volume import Grid, voxelise
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import Scene
+from tests.support.scenes.seam import no_seam, seam, steps, strips
 
 LOW_M, HIGH_M = np.array([-0.165, -0.095, 0.004]), np.array([0.165, 0.095, 0.100])  # the specimen above the board
 THRESHOLD_HU = -475.0

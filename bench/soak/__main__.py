@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.machine import REPOSITORY, commit, machine
-from bench.soak import captures, creep, large, speed, together
+from bench.soak import captures, large, speed, together
+from tests.support.soak import creep
 
 RESULTS = REPOSITORY / "bench" / "results"
 PARTS = ("captures", "large", "together", "speed")

@@ -4,7 +4,7 @@ The programs are `simulate rig` (with a sped-up arm), `run` with its driver proc
 whose pages are read all the time. A simulated person types the answers to the run's questions (bench/soak/person.py).
 Every few seconds memory (its own and resident), descriptors and threads of every process are sampled, and the sizes
 of the database, write-ahead log and logs. After a warm-up a line is fitted over the number of captures, which
-bench/soak/creep.py judges.
+tests/support/soak/creep.py judges.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import httpx
 import psutil
 import yaml
 
-from bench.soak.creep import CHILD, FEWEST, Sample, judge, warmed_up
 from bench.soak.person import Typist
 from service.core.records.events import Payload, ViewpointCaptured
 from service.core.run.state import RunState
@@ -30,6 +29,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.serving import PASSWORD, Server, serving
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
+from tests.support.soak.creep import CHILD, FEWEST, Sample, judge, warmed_up
 
 _HOST = "127.0.0.81"
 _SPEED_UP = 20

@@ -16,12 +16,12 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from bench.soak.fit import Duration, exponent
-from bench.soak.large_record import STEP, TIMED, LargeRecord
 from service.cli.main import app
 from service.core.records.events import StepNote
 from service.store.verification.verify import verify
 from tests.support.pages.web import Browser, web_site
+from tests.support.soak.fit import Duration, exponent
+from tests.support.soak.large_record import STEP, TIMED, LargeRecord
 
 MOST_EXPONENT = 1.15
 PAGE_S = 1.0  # limit for a page of the largest run, requested again or following the run

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.soak.large_record import STEP, LargeRecord
 from service.core.records.events import StepNote
 from service.followed_run import RunFollower, read_log
 from service.run_start import recorded_run
@@ -16,6 +15,7 @@ from service.steps.context import Evidence
 from service.store.verification.verify import show
 from service.web.capture.view import views_of
 from tests.support.record.counting import lines_of
+from tests.support.soak.large_record import STEP, LargeRecord
 
 SMALL, LARGE = 100, 200
 MOST = 2.3  # limit of the ratio for twice as many viewpoints

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.torture.faults.place.disk import FaultyDisk
 from drivers import errors as device_errors
 from drivers.ur.link import probe
 from service.core import errors as core_errors
@@ -21,6 +20,7 @@ from service.core.errors import OrthocaptureError
 from service.store.signatures.log import NAME
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.processes.faulty_disk import FaultyDisk
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 ROOT = Path(__file__).parents[2]

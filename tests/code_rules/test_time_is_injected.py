@@ -54,6 +54,7 @@ TESTS = {
     "tests/support/pages/certificates.py": "certificates hold for the host's time",
     "tests/support/record/time_stamp_authority.py": "certificates hold for the host's time",
     "tests/support/processes": "other processes go by the host's clock; until() is how a test waits for one",
+    "tests/support/soak/fit.py": "measures durations, which a benchmark reports",
     "tests/support/vendor": "other programs, which drive simulators in real time",
     "tests/support/rig/host_fake_driver.py": "runs in the driver's process",
     "tests/support/rig/world_watch.py": "looks at a simulator in real time",

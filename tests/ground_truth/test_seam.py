@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from bench.ground_truth.seam import Steps, no_seam, seam, steps, strips
 from service.core.geometry import Array
+from tests.support.scenes.seam import Steps, no_seam, seam, steps, strips
 
 WITHIN_M, BLEND_M, STEP_M = 3e-3, 3e-3, 1e-4
 X_M, Y_M = (

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.torture.faults.place.disk import FaultyDisk
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import StepNote
 from service.runner.held_run import held_run
@@ -19,6 +18,7 @@ from service.store.records import LeaseHeldError
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
+from tests.support.processes.faulty_disk import FaultyDisk
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 NOTE = StepNote(step="fixation", attempt=1, note="seen")

@@ -32,7 +32,7 @@ KINDS = [
 ]
 FORGETFUL = """
 from bench.torture.crash.__main__ import main
-from bench.torture.crash.mortal import MortalFiles
+from tests.support.processes.mortal_files import MortalFiles
 MortalFiles.sync_file = lambda _self, _path: None  # a store that writes and renames, and does not sync
 main()
 """

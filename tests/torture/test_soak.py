@@ -17,10 +17,10 @@ from sqlalchemy import text
 
 from bench.soak.__main__ import main
 from bench.soak.captures import figures_of
-from bench.soak.creep import DATABASE_DESCRIPTORS, JUDGED_S, Sample, judge
-from bench.soak.fit import Duration, exponent, growth
 from bench.soak.large import judge as judge_large
 from service.store.store import Store
+from tests.support.soak.creep import DATABASE_DESCRIPTORS, JUDGED_S, Sample, judge
+from tests.support.soak.fit import Duration, exponent, growth
 
 pytestmark = [pytest.mark.timeout(600)]
 SMALL = (

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.soak.large_record import LargeRecord
 from service.core.geometry import apply, inverse, look_at
 from service.core.records.events import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, scene_json, viewing_frame
@@ -28,6 +27,7 @@ from tests.support.pages.web import web_site
 from tests.support.record.core import EYE
 from tests.support.recorded.calibrated_run import VIEWS, begin_calibrated_run, capture
 from tests.support.runs.recorded_run import record_run
+from tests.support.soak.large_record import LargeRecord
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from bench.torture.crash.confirmed import confirmed
-from bench.torture.crash.mortal import read_journal
 from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
 from service.core.protocol.models import Protocol
@@ -25,6 +24,7 @@ from service.store.records import StoreVersionError
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.processes.mortal_files import read_journal
 
 ROLES: tuple[Role, ...] = ("begin", "runner", "worker", "web")
 

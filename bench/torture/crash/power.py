@@ -10,8 +10,8 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from bench.torture.crash.mortal import read_journal
 from service.store.database.engine import database_path
+from tests.support.processes.mortal_files import read_journal
 
 
 @dataclass

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from bench.torture.crash.mortal import MortalFiles, Point
 from bench.torture.crash.remembered import remembering
 from bench.torture.crash.scene import CAMERA, LAYOUT, VIEWPOINTS, CrashRig, prepare_files
 from service.core.gates.release import refuse_release
@@ -31,6 +30,7 @@ from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker import loop
+from tests.support.processes.mortal_files import MortalFiles, Point
 from tests.support.rig.bench_rig import ScriptedOperator
 
 _SOFTWARE = software_versions()

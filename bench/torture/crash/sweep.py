@@ -14,10 +14,10 @@ from random import Random
 from typing import Literal
 
 from bench.torture.crash.check import ROLES, Outcome, after_the_crash, at_the_end, of_a_beginning, outcome
-from bench.torture.crash.mortal import Point, points, read_journal
 from bench.torture.crash.power import lose_power
 from bench.torture.crash.run import Place, Role, prepare, start
 from service.store.store import Store
+from tests.support.processes.mortal_files import Point, points, read_journal
 
 How = Literal["kill", "power"]
 _ALONE: dict[Role, str] = {"begin": "Ada", "web": "Sue"}  # processes that work alone, and who acts in them

@@ -18,10 +18,10 @@ import numpy as np
 import trimesh
 
 from bench.torture.faults.place.ct_suite import Suite
-from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
 from bench.torture.faults.place.newer_rigs import Film, OtherClient, pendant
 from service.store.database.engine import database_path
+from tests.support.processes.faulty_disk import FaultyDisk, JumpingClock
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 if TYPE_CHECKING:

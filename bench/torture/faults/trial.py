@@ -19,7 +19,6 @@ from bench.torture.faults.case import Case
 from bench.torture.faults.judgement import rules
 from bench.torture.faults.judgement.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
 from bench.torture.faults.place.ct_suite import Suite
-from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.laboratory import (
     CT,
     PROTOCOL,
@@ -55,6 +54,7 @@ from service.steps import params_models
 from service.store.database.engine import database_path
 from service.store.store import Store
 from service.worker import loop
+from tests.support.processes.faulty_disk import FaultyDisk, JumpingClock
 from tests.support.rig.bench_rig import BenchArm, BenchCamera
 
 STATIONS: dict[str, dict[str, Any]] = {

@@ -2,7 +2,7 @@
 
 The runner takes the first viewpoints, and a few at each size, on the in-memory rig of the tests. Those between are
 recorded as a capture records them: photograph and poses into the store, one transaction with rows and event, then a
-job that evaluates it, enqueued, claimed and finished. The photographs are sparse files (bench/soak/sparse.py).
+job that evaluates it, enqueued, claimed and finished. The photographs are sparse files (sparse.py).
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.soak.fit import Duration
-from bench.soak.sparse import SparseFiles, sparse_photograph
 from service.computations import live_view
 from service.computations.records import Camera, Limits, PosedPhotograph
 from service.core.protocol.models import parse_protocol
@@ -26,6 +24,8 @@ from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from tests.support.runs.bench_run import PROTOCOL, Bench, HastyClock
+from tests.support.soak.fit import Duration
+from tests.support.soak.sparse import SparseFiles, sparse_photograph
 
 STEP = "capture"
 TIMED = 200  # viewpoints before each size that are recorded with every fsync and timed

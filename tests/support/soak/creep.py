@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.soak.fit import Growth, growth
+from tests.support.soak.fit import Growth, growth
 
 WARM_UP = 0.25  # fraction of the time that is left out
 FEWEST = 8  # minimum number of samples after the warm-up
