@@ -295,7 +295,8 @@ class _Forger:
                     else row
                     for row in line.rows
                 ]
-                raw = line_bytes(LineFields(line.number, line.after, previous, line.continued), rows)
+                fields = LineFields(line.number, line.after, previous, line.continued, line.earlier_events)
+                raw = line_bytes(fields, rows)
                 previous, content = hashlib.sha256(raw).hexdigest(), content + raw
         journal.write_bytes(content)
 

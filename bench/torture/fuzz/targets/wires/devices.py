@@ -26,7 +26,7 @@ from service.cli.operators import SimulatedHands
 from service.core.run.noted import HandWork
 from service.store.events import canonical
 from simulators.faults import FaultPlan
-from simulators.lightbox import Lightbox
+from simulators.lightbox import FIRMWARES, MODEL, SERIAL, Lightbox, Make
 from simulators.ptpip import codec
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.world import Scene
@@ -174,7 +174,7 @@ def _box_requests(_: Path) -> list[bytes]:
 
 
 def _box(data: bytes, _: Path) -> None:
-    box = Lightbox(FaultPlan(), None, None)
+    box = Lightbox(FaultPlan(), None, None, Make(MODEL, SERIAL, FIRMWARES[-1]))
     line = os.open(box.plug_in(), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         for at in range(0, min(len(data), 1 << 14), 1024):
