@@ -67,7 +67,9 @@ def spheres_of(summary: RunSummary) -> list[WorldSphere]:
 
 def test_without_an_arm_or_its_rig_file_the_posts_are_not_known(run: RecordedRun, dataset: DataSet) -> None:
     summary = run.summary()
-    imported = dataclasses.replace(summary, root=summary.root.model_copy(update={"origin": "imported"}))
+    first, *others = summary.events
+    root = first.model_copy(update={"payload": summary.root.model_copy(update={"origin": "imported"})})
+    imported = dataclasses.replace(summary, events=[root, *others])
     (step,) = (step.id for step in run.protocol.steps if step.gives == "registrations")
     now = run.state.steps[step]
     by_images = {name: T for name, T in now.result["registrations"].items() if "robot" not in name}
