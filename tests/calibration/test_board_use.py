@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import re
 from collections.abc import Generator
 from pathlib import Path
@@ -15,7 +17,8 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewJob
-from service.web.record.images import board_uses
+from service.web.calibration.view import calibration_of, image_rows
+from service.web.record.images import board_use, board_uses
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.record.core import EYE
@@ -87,3 +90,28 @@ def test_the_calibration_page_shows_first_what_it_does_without(web: WebSite) -> 
     thumbnail = re.search(r'class="board-thumb" src="([^"]+)"', table)
     assert thumbnail is not None
     assert web.browser("auditor").get(thumbnail[1]).status_code == 200
+
+
+def test_images_of_a_hand_eye_calibration_with_a_step_of_its_own_count_as_used(web: WebSite) -> None:
+    """The page of exvivo_spine said "0 used, 30 not", and nothing of the other 90."""
+    run_id = begin_calibrated_run(web)
+    log = web.site.run(run_id)
+    found = calibration_of(log)
+    assert found is not None
+    (views,) = found.captures
+    result = copy.deepcopy(dict(log.state.steps["calibration"].result))
+    intrinsics = result["details"]["intrinsics"]
+    intrinsics["images"] = [f"a{name[1:]}" for name in intrinsics["images"]]  # those of an earlier step
+    intrinsics["excluded"] = []
+    hand_eye = dataclasses.replace(log.state.steps["calibration"], result=result)
+    assert found.best is not None
+    placed = found.best.residuals.held_out_mm.keys()
+    assert placed
+    assert {view.viewpoint for view in views if board_use(hand_eye, view).used} == set(placed)
+
+    first = [view.model_copy(update={"step": "earlier", "viewpoint": f"a{view.viewpoint[1:]}"}) for view in views]
+    states = {"calibration": hand_eye, "earlier": hand_eye}
+    both = dataclasses.replace(found, captures=(tuple(first), views), states=states)
+    rows = {row.name: row for row in image_rows(both)}
+    assert rows.keys() == {view.viewpoint for view in (*first, *views)}
+    assert sum(row.use.used is True for row in rows.values()) == len(first) + len(placed)

@@ -181,7 +181,7 @@ def _advice(
     poses = advised_poses(
         found.hand_eye,
         found.camera,
-        [c for c in found.captures if isinstance(c, ViewpointCaptured) and c.viewpoint in used],
+        [c for c in found.last_captures if isinstance(c, ViewpointCaptured) and c.viewpoint in used],
         board,
         recorded_rig_section(log).collision.arm or "",
         site.data,

@@ -48,7 +48,8 @@ class Calibration:
         intrinsics: the rest that is known about the camera besides its parameters; None: not solved yet.
         hand_eye: the hand-eye calibration; None: not solved yet.
         best: the answer that the registration uses: with the arm's correction where there is one.
-        captures: the board images, of the step whose images were used.
+        captures: the board images of each step whose images were used: one step's, or first those of the intrinsics
+            and last those of the hand-eye calibration.
         artefact: calibration.json of the last step.
         states: the states of all steps of the run.
     """
@@ -58,10 +59,15 @@ class Calibration:
     intrinsics: Intrinsics | None
     hand_eye: HandEye | None
     best: HandEye | ArmAnswer | None
-    captures: tuple[RecordedView, ...]
+    captures: tuple[tuple[RecordedView, ...], ...]
     artefact: ArtefactRef | None
     robots: tuple[str, ...]
     states: Mapping[str, StepState]
+
+    @property
+    def last_captures(self) -> tuple[RecordedView, ...]:
+        """The board images of the last step whose images were used."""
+        return self.captures[-1] if self.captures else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +97,7 @@ def calibration_of(log: RunRecord) -> Calibration | None:
         for answer, (_, state) in zip(answers, solved, strict=True)
         if answer.hand_eye is not None
     ]
-    captures = [found for step, _ in solved if (found := _board_images(log, step))]
+    captures = tuple(found for source in _sources(solved) if (found := _board_images(log, source)))
     hand_eye, robots = hand_eyes[-1] if hand_eyes else (None, ())
     files = [ref for ref in solved[-1][1].artefacts if ref.kind == "calibration"]
     return Calibration(
@@ -100,7 +106,7 @@ def calibration_of(log: RunRecord) -> Calibration | None:
         intrinsics=intrinsics[-1] if intrinsics else None,
         hand_eye=hand_eye,
         best=None if hand_eye is None else hand_eye.best,
-        captures=captures[-1] if captures else (),
+        captures=captures,
         artefact=files[-1] if files else None,
         robots=robots,
         states=log.state.steps,
@@ -113,9 +119,13 @@ class _Robots(BaseModel):
     robots: tuple[str, ...] = ()
 
 
-def _board_images(log: RunRecord, step: Step) -> tuple[RecordedView, ...]:
-    """Return the valid board images that a calibration step used: its own, or those of an earlier step."""
-    source = step.params_as(Params).images_of or step.id
+def _sources(solved: Sequence[tuple[Step, StepState]]) -> list[str]:
+    """Return the steps whose board images were used, each once: a calibration's own, or those of an earlier step."""
+    return list(dict.fromkeys(step.params_as(Params).images_of or step.id for step, _ in solved))
+
+
+def _board_images(log: RunRecord, source: str) -> tuple[RecordedView, ...]:
+    """Return the valid board images of a step."""
     return tuple(capture.payload for capture in captures_of(log, source) if capture.replaced is None)
 
 
@@ -175,7 +185,11 @@ def hand_eye_chart(calibration: Calibration) -> DotPlot | None:
 
 
 def image_rows(calibration: Calibration) -> list[ImageRow]:
-    """Return every board image with its residuals, unused images first."""
+    """Return every board image with its residuals, unused images first.
+
+    A view's name is unique within its step alone: residuals of the intrinsics are those of the first step's images,
+    residuals of the hand-eye calibration those of the last step's.
+    """
     record = calibration.intrinsics or Intrinsics()
     validation = record.cross_validation
 
@@ -185,24 +199,29 @@ def image_rows(calibration: Calibration) -> list[ImageRow]:
     rms = by_image(record.per_view_rms_px)
     five = by_image(() if validation is None else validation.five_fold_view_px)
     one = by_image(() if validation is None else validation.leave_one_out_view_px)
-    residuals = Residuals(held_out_mm={}, held_out_deg={}) if calibration.best is None else calibration.best.residuals
-    rows = [
-        ImageRow(
-            name=name,
-            rms_px=rms.get(name),
-            five_fold_px=five.get(name),
-            leave_one_out_px=one.get(name),
-            residual_mm=residuals.mm.get(name),
-            residual_deg=residuals.deg.get(name),
-            held_out_mm=residuals.held_out_mm.get(name),
-            held_out_deg=residuals.held_out_deg.get(name),
-            sha256=capture.artefacts[0].sha256,
-            step=capture.step,
-            use=board_use(calibration.states[capture.step], capture),
-        )
-        for capture in calibration.captures
-        for name in (capture.viewpoint,)
-    ]
+    none = Residuals(held_out_mm={}, held_out_deg={})
+    residuals = none if calibration.best is None else calibration.best.residuals
+    rows: list[ImageRow] = []
+    for place, captures in enumerate(calibration.captures):
+        first, last = place == 0, place == len(calibration.captures) - 1
+        placed = residuals if last else none
+        for capture in captures:
+            name = capture.viewpoint
+            rows.append(
+                ImageRow(
+                    name=name,
+                    rms_px=rms.get(name) if first else None,
+                    five_fold_px=five.get(name) if first else None,
+                    leave_one_out_px=one.get(name) if first else None,
+                    residual_mm=placed.mm.get(name),
+                    residual_deg=placed.deg.get(name),
+                    held_out_mm=placed.held_out_mm.get(name),
+                    held_out_deg=placed.held_out_deg.get(name),
+                    sha256=capture.artefacts[0].sha256,
+                    step=capture.step,
+                    use=board_use(calibration.states[capture.step], capture),
+                )
+            )
     return sorted(rows, key=lambda row: row.use.used is not False)  # stable: what is not used first
 
 
@@ -277,7 +296,7 @@ def _later_checks(log: RunRecord, calibrated: set[str]) -> list[LaterCheck]:
 def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
     """Return the certificate, from the recorded events alone."""
     state, (_, there) = log.state, calibration.steps[-1]
-    first = calibration.captures[0] if calibration.captures else None
+    first = calibration.last_captures[0] if calibration.captures else None
     ids = {step.id for step, _ in calibration.steps}
     signatures = [
         StepSignature(event.payload.step or "", event.actor, event.at_utc, event.payload.meaning)

@@ -214,7 +214,7 @@ def board_use(state: StepState, view: RecordedView) -> BoardUse:
     intrinsics = Intrinsics() if answer is None else answer.details.intrinsics or Intrinsics()
     solved, why = set(intrinsics.images), _reasons(state, answer)
     excluded = {entry.image for entry in intrinsics.excluded}
-    if name in solved and name not in excluded:
+    if (name in solved and name not in excluded) or name in _hand_eye_images(answer):
         return BoardUse(True, "Used", why.get(name, ""))
     found = None
     if look is not None and look.status == "finished":
@@ -233,6 +233,14 @@ def board_use(state: StepState, view: RecordedView) -> BoardUse:
     if look is not None and look.status == "finished":
         return BoardUse(None, "Board found", "it will be used once all images have been taken")
     return BoardUse(None, "Being examined" if look is not None else "Not examined yet")
+
+
+def _hand_eye_images(answer: calibrate.Answer | None) -> set[str]:
+    """Return the images that a hand-eye calibration used; one that has a step of its own takes images of its own."""
+    if answer is None or answer.hand_eye is None:
+        return set()
+    residuals = answer.hand_eye.best.residuals
+    return residuals.mm.keys() | residuals.held_out_mm.keys()
 
 
 def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
