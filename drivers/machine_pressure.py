@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -90,49 +89,46 @@ class HeldUp:
     """
 
     process: int | str
-    monotonic: Callable[[], float] = time.monotonic
     _began: dict[int, ProcessorTime] = field(init=False)
     _memory_s: float = field(init=False)
     _seen: dict[int, _Seen] = field(init=False, default_factory=dict[int, "_Seen"])
 
     def __post_init__(self) -> None:
-        self._began, self._memory_s = processor_times(self.process), memory_stall_s()
         self.look()
+        self._began = {thread: seen.times for thread, seen in self._seen.items()}
+        self._memory_s = memory_stall_s()
 
     def look(self) -> None:
         """Look at the threads once more."""
-        now_s, before = self.monotonic(), self._seen
+        now_s, before = time.monotonic(), self._seen
         self._seen = {}
         for thread, times in processor_times(self.process).items():
-            last, ready = before.get(thread), _is_ready(thread, self.process)
-            waits = ready and last is not None and last.waits_since_s is not None and last.times == times
-            since_s = last.waits_since_s if last is not None and waits else now_s
-            self._seen[thread] = _Seen(times, since_s if ready else None)
+            since_s = None
+            if _is_ready(thread, self.process):
+                last = before.get(thread)
+                waits_on = last is not None and last.times == times and last.waits_since_s is not None
+                since_s = last.waits_since_s if last is not None and waits_on else now_s
+            self._seen[thread] = _Seen(times, since_s)
 
     @property
     def seconds(self) -> float:
         """The longest that one of its threads has waited for a processor, and the time lost to want of memory."""
         self.look()
-        now_s = self.monotonic()
-        waits_s = [
-            seen.times.waited_s - self._before(thread).waited_s
-            + (0.0 if seen.waits_since_s is None else now_s - seen.waits_since_s)
-            for thread, seen in self._seen.items()
-        ]  # fmt: skip
-        return max(waits_s, default=0.0) + memory_stall_s() - self._memory_s
+        now_s, longest_s = time.monotonic(), 0.0
+        for thread, seen in self._seen.items():
+            going_on_s = 0.0 if seen.waits_since_s is None else now_s - seen.waits_since_s
+            longest_s = max(longest_s, seen.times.waited_s - self._before(thread).waited_s + going_on_s)
+        return longest_s + memory_stall_s() - self._memory_s
 
     @property
     def share(self) -> float:
         """Return the part, 0 to 1, of the time in which its threads wanted to run and could not."""
         computed_s = waited_s = 0.0
-        for thread, times in self._now().items():
+        for thread, times in processor_times(self.process).items():
             computed_s += times.computed_s - self._before(thread).computed_s
             waited_s += times.waited_s - self._before(thread).waited_s
         waited_s += memory_stall_s() - self._memory_s
         return waited_s / (computed_s + waited_s) if waited_s > 0 else 0.0
-
-    def _now(self) -> dict[int, ProcessorTime]:
-        return processor_times(self.process)
 
     def _before(self, thread: int) -> ProcessorTime:
         return self._began.get(thread, ProcessorTime(0.0, 0.0))

@@ -47,6 +47,11 @@ class RecordedDevice:
         """Return the questions that were asked in vain, each with the reason."""
         return tuple(self.answers.get("silent", ()))
 
+    @property
+    def unanswered(self) -> tuple[str, ...]:
+        """Return the same in the words of a ready line, which names what is not served."""
+        return tuple(f"not recorded: {question}" for question in self.silent)
+
     def sample(self, source: str) -> dict[str, tuple[float, ...]]:
         """The numbers of a source that begins so; none if it was silent."""
         found = next((one for one in self.answers.get("samples", ()) if one["source"].startswith(source)), None)
@@ -67,10 +72,10 @@ def not_recorded(args: argparse.Namespace) -> list[str]:
     """Return what the body that is replayed did not tell when it was recorded, and what was taken out."""
     if not args.replay:
         return []
-    answers = recorded_device(args.replay, "gphoto", args.replayed).answers
-    texts = [one["code"] for one in answers["listing"]["properties"] if one["type"] == "str" and not one["value"]]
+    device = recorded_device(args.replay, "gphoto", args.replayed)
+    texts = [one["code"] for one in device.listing["properties"] if one["type"] == "str" and not one["value"]]
     empty = [f"texts that are empty or were taken out: {', '.join(texts)}"] if texts else []
-    return [*empty, *(f"not recorded: {why}" for why in answers.get("silent", ()))]
+    return [*empty, *device.unanswered]
 
 
 def recorded_devices(file: Path) -> tuple[RecordedDevice, ...]:

@@ -85,7 +85,7 @@ class SettleCriteria:
 
 @dataclass(frozen=True, slots=True)
 class SettleReport:
-    """Return whether the last window of the pose stream meets the settle criteria, with the measured values."""
+    """Says whether the last window of the pose stream meets the settle criteria, with the measured values."""
 
     settled: bool
     samples: int

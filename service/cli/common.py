@@ -99,9 +99,8 @@ def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
     """Print an error and return the exit to raise, as in `raise fail(error)`, with `exit_status`."""
     status = exit_status(error)
     if json:
-        print_json(
-            {"error": error_record(error), **({"exit_status": status} if status is not ExitStatus.FAILED else {})}
-        )
+        special = {} if status is ExitStatus.FAILED else {"exit_status": status}
+        print_json({"error": error_record(error), **special})
     else:
         error_console.tell(("Error:", "bold red"), f" {error.what}")
         if error.where:

@@ -20,7 +20,8 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.computations.fuse.compute import MEANINGS, FusedMeshes, MeshFusionSettings, fuse_meshes
+from service.cli.exit_status import ExitStatus
+from service.computations.fuse.compute import MEANINGS, STAGES, FusedMeshes, MeshFusionSettings, fuse_meshes
 from service.compute.ground_truth.align import align
 from service.compute.ground_truth.fuse import Source
 from service.compute.ground_truth.surface import Surface
@@ -86,7 +87,7 @@ def fuse_command(
             heat_map=heat_map is not None,
         )
         with progress_bar(quiet=json) as report:
-            report("spheres", 0, 4)
+            report("spheres", 0, STAGES)
             aligned = align(tomogram, scanned, settings.radius_m)
             found = fuse_meshes(lambda: tomogram, scanned, aligned, settings, report)
         unit_m = METRES_PER_UNIT[of_scan.unit]
@@ -103,7 +104,7 @@ def fuse_command(
             _show(record)
             console.print(f"written: {out}")
     if not verdict.passed:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _surface(file: ScannedMesh) -> Surface:

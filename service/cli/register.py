@@ -24,6 +24,7 @@ from service.cli.common import (
     tell_left_out,
     write_whole,
 )
+from service.cli.exit_status import ExitStatus
 from service.cli.spheres import SeedsOption, spheres_of
 from service.computations.detect_spheres import DetectorName
 from service.computations.detect_spheres.compute import detector_of, search_outlines
@@ -179,7 +180,7 @@ def register_command(
             _tell(result, record, verdicts)
             console.print(f"written: {out}")
         if not passed:
-            raise typer.Exit(1)
+            raise typer.Exit(ExitStatus.FAILED)
 
 
 def _gates(result: PipelineResult) -> list[Gate]:

@@ -6,7 +6,7 @@ import importlib
 import multiprocessing
 import resource
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -40,6 +40,16 @@ def mapping(workers: int, items: int) -> Generator[MapFunction]:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, items), mp_context=context, initializer=_one_thread) as pool:
         yield pool.map
+
+
+def report_each(
+    results: Iterable[_Result], total: int, progress: Callable[[int, int], None] | None
+) -> Iterator[_Result]:
+    """Yield the results, and report after each how many of all there are; `progress` None reports nothing."""
+    for done, result in enumerate(results, 1):
+        yield result
+        if progress is not None:
+            progress(done, total)
 
 
 def _one_thread() -> None:

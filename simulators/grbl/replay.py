@@ -58,7 +58,7 @@ def recorded(device: RecordedDevice) -> tuple[Said, dict[int, float]]:
         state = ""
     served = ("$$", "$I", "?")
     not_served += [f"{asked}: {answer}" for asked, answer in device.exchanges.items() if asked not in served]
-    not_served += [f"not recorded: {why}" for why in device.silent]
+    not_served += device.unanswered
     return Said(stated[0].removeprefix("v"), tuple(build), tuple(settings), state, tuple(not_served)), settings
 
 

@@ -82,7 +82,7 @@ def recorded(device: RecordedDevice) -> Recorded:
         joints,
         stream.get("override", (1.0,))[0],
         stream.get("time_s", (0.0,))[0],
-        (*not_served, *(f"not recorded: {why}" for why in device.silent)),
+        (*not_served, *device.unanswered),
     )
 
 

@@ -33,7 +33,7 @@ class Recorded:
     joints: Array | None  # (6,); None if its stream was not open
     answers: Mapping[str, str]
     sample: Mapping[str, tuple[float, ...]]
-    silent: tuple[str, ...]
+    unanswered: tuple[str, ...]
 
     def set_up(self, controller: Controller) -> Words:
         """Put a controller into the recorded state; returns the words in which its dashboard answered."""
@@ -67,7 +67,7 @@ class Recorded:
             if question.lower() in _OF_THE_PROGRAM or TAKEN_OUT.search(answer)
         ]
         own += [f"RTDE, {name}" for name in self.sample if name not in (*_SET, "actual_TCP_pose")]
-        return (*own, *(f"not recorded: {why}" for why in self.silent))
+        return (*own, *self.unanswered)
 
 
 def recorded(device: RecordedDevice) -> Recorded:
@@ -86,7 +86,7 @@ def recorded(device: RecordedDevice) -> Recorded:
         model = replace(model, **{field: cast(Six, values) for field, values in own.items()})
     sample = device.sample("RTDE")
     joints = np.array(sample["actual_q"]) if "actual_q" in sample else None
-    return Recorded(model, version, joints, answers, sample, device.silent)
+    return Recorded(model, version, joints, answers, sample, device.unanswered)
 
 
 def _fits(model: str, version: fields.Version) -> bool:

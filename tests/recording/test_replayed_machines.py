@@ -148,9 +148,8 @@ def test_a_grbl_machine_is_the_same_on_the_replay_of_its_recording(tmp_path: Pat
     port = tmp_path / "again"
     with simulator("grbl", "--link", str(port), "--replay", str(tmp_path / "first.json")) as running:
         again = recorded(tmp_path / "again.json", "table", table_section(port))
-    assert (tmp_path / "again.json").read_text().splitlines()[4:] == (
-        (tmp_path / "first.json").read_text().splitlines()[4:]
-    )
+    files = [json.loads((tmp_path / name).read_text()) for name in ("first.json", "again.json")]
+    assert files[0]["devices"] == files[1]["devices"]
     assert again == first
     assert first.report is not None
     assert any("Soft limits are off" in problem for problem in first.report.problems)

@@ -38,7 +38,7 @@ from service.machine.resources import large_arrays_returned
 _MM = 1e-3  # metres in the unit of a job's files
 _FRAME = "in the frame of the scan, mm"
 MEANINGS = "source 0: CT, 1: scan, 2: blend; sigma along the normal"
-_STAGES = 4  # of a fusion, for its progress
+STAGES = 4  # of a fusion, for its progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,12 +148,12 @@ def fuse_meshes(
         ComputeError: the two surfaces are nowhere near each other.
     """
     up = upwards(scan)
-    progress("distances", 1, _STAGES)
+    progress("distances", 1, STAGES)
     common = common_part(read_ct().moved(aligned.T_scan_ct), aligned, settings.radius_m)
     score = chamfer(
         common.ct, scan, ChamferSettings(settings.spacing_m, to_faces=False, of_vertices=settings.heat_map)
     )
-    progress("fusion", 2, _STAGES)
+    progress("fusion", 2, STAGES)
     fusion = FusionSettings(
         blend_m=settings.blend_m,
         sigma_ct_m=aligned.sigma_ct_m,
@@ -166,7 +166,7 @@ def fuse_meshes(
     if settings.post_radius_m is not None:
         markers = Markers(aligned.scan_spheres_m, settings.radius_m, up, settings.post_radius_m)
         fused = without_markers(fused, markers)
-    progress("pictures", 3, _STAGES)
+    progress("pictures", 3, STAGES)
     return FusedMeshes(aligned, common.ct, scan, score, fused, wound_m)
 
 
@@ -179,7 +179,7 @@ def upwards(scan: Surface) -> Array:
 def fuse(context: JobContext[job.Arguments]) -> JobAnswer:
     """Fuse the meshes of a job, and close the loop through the images if there are any."""
     arguments = context.arguments
-    context.progress("spheres", 0, _STAGES)
+    context.progress("spheres", 0, STAGES)
     aligned = align_spheres(_spheres(arguments.ct), _spheres(arguments.scan))
     scan = Surface.kept(context.input(arguments.scan_mesh))
     frames, up = _frames(arguments, aligned), upwards(scan)

@@ -19,7 +19,7 @@ from service.compute.images.photographs import read_grey
 from service.compute.intrinsics.adjustment import fit_pose, pose_matrix, start_pose
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse
-from service.machine.processes import mapping
+from service.machine.processes import mapping, report_each
 
 _MANY_FILES = 24
 _MANY_BYTES = 30e6
@@ -73,13 +73,8 @@ def find_boards(
     if board.pattern == "charuco":
         board.charuco()
     work = partial(_find, board=board)
-    found: list[BoardImage] = []
     with mapping(workers if _worth_processes(files) else 1, len(files)) as map_over:
-        for image in map_over(work, files):
-            found.append(image)
-            if progress:
-                progress(len(found), len(files))
-    return tuple(found)
+        return tuple(report_each(map_over(work, files), len(files), progress))
 
 
 def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
@@ -36,7 +36,7 @@ from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
-from service.machine.processes import MapFunction, mapping
+from service.machine.processes import MapFunction, mapping, report_each
 
 _MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
 
@@ -113,7 +113,7 @@ def detect_all(
     """
     with mapping(workers, len(image_paths)) as map_over:
         work = partial(_detected, detect or detect_file, camera, options)
-        return tuple(_report_each(map_over(work, image_paths), len(image_paths), progress))
+        return tuple(report_each(map_over(work, image_paths), len(image_paths), progress))
 
 
 def _detected(
@@ -161,7 +161,7 @@ def locate_outlines(
         look = partial(_look, camera=images.camera, options=options)
         first = _register_anchors(image_paths, images, spheres, [m for m in sets if len(m)], options, map_over)
         if first is None:
-            found = tuple(_report_each(map_over(look, [_Task(path) for path in image_paths]), n, progress))
+            found = tuple(report_each(map_over(look, [_Task(path) for path in image_paths]), n, progress))
             return searched_whole([f.outlines for f in found])
         known = len(spheres.centres_m)
         centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
@@ -169,7 +169,7 @@ def locate_outlines(
             _Task(path, PredictedSpheres(inverse(T), centres, spheres.radius_m, first.margin, first.tone, known))
             for path, T in zip(image_paths, first.T_scan_camera, strict=True)
         ]
-        found = tuple(_report_each(map_over(look, tasks), n, progress))
+        found = tuple(report_each(map_over(look, tasks), n, progress))
         again = [i for i, f in enumerate(found) if f.spheres is not None]
         if len(again) < (1 - _MOST_FAILED) * n:
             whole = dict(zip(again, map_over(look, [_Task(image_paths[i]) for i in again]), strict=True))
@@ -217,7 +217,7 @@ def search_nearby(
     """
     with mapping(workers, len(expected)) as map_over:
         work = partial(_nearby, camera=camera, options=options)
-        return tuple(_report_each(map_over(work, expected), len(expected), progress))
+        return tuple(report_each(map_over(work, expected), len(expected), progress))
 
 
 def _nearby(
@@ -234,13 +234,6 @@ def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutl
 
 def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageOutlines:
     return find_outlines(read_image_of(task.path, camera), camera, task.expected, options)
-
-
-def _report_each(results: Iterable[_Result], total: int, progress: Progress | None) -> Iterator[_Result]:
-    for done, result in enumerate(results, 1):
-        yield result
-        if progress is not None:
-            progress(done, total)
 
 
 _ANCHORS = (2, 4)  # images of a station that are searched first; the larger number if the first do not agree

@@ -324,28 +324,16 @@ def _lines(marks: Sequence[TimeMark]) -> tuple[str, ...]:
 def _range(values: Sequence[float], limit: float | None, *, from_zero: bool) -> tuple[float, float]:
     low, high = min(values), max(values)
     if from_zero and low >= 0:
-        most = (
-            max(high, limit) if limit is not None and limit < 4 * high else high
-        )  # a far one would flatten the rest
-        return 0.0, 1.1 * most or 1.0
+        near = limit is not None and limit < 4 * high  # a far one would flatten the rest
+        return 0.0, 1.1 * (max(high, limit) if limit is not None and near else high) or 1.0
     apart = high - low or 0.002 * abs(high) or 1.0
     return low - 0.25 * apart, high + 0.25 * apart
 
 
 def _days(first: float, last: float) -> list[tuple[float, str]]:
     """Return up to five times on whole hours, days, or multiples of them, in UTC."""
-    steps = (
-        900.0,
-        3600.0,
-        3 * 3600.0,
-        6 * 3600.0,
-        _DAY_S,
-        2 * _DAY_S,
-        7 * _DAY_S,
-        14 * _DAY_S,
-        30 * _DAY_S,
-        91 * _DAY_S,
-    )
+    hours, days = (0.25, 1, 3, 6), (1, 2, 7, 14, 30, 91)
+    steps = (*(3600.0 * k for k in hours), *(_DAY_S * k for k in days))
     step = next((s for s in steps if (last - first) / s <= 4), 365 * _DAY_S)
     at = [k * step for k in range(math.ceil(first / step), math.floor(last / step) + 1)]
     pattern = "%m-%d %H:%M" if step < _DAY_S else "%Y-%m-%d"

@@ -214,7 +214,7 @@ def board_use(state: StepState, view: RecordedView) -> BoardUse:
     intrinsics = Intrinsics() if answer is None else answer.details.intrinsics or Intrinsics()
     solved, why = set(intrinsics.images), _reasons(state, answer)
     excluded = {entry.image for entry in intrinsics.excluded}
-    if (name in solved and name not in excluded) or name in _hand_eye_images(answer):
+    if name not in excluded and (name in solved or name in _hand_eye_images(answer)):
         return BoardUse(True, "Used", why.get(name, ""))
     found = None
     if look is not None and look.status == "finished":
