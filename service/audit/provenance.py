@@ -8,14 +8,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sqlalchemy import Connection, text
+from sqlalchemy import Connection, bindparam, text
 
 from service.audit.background import IncrementalResults, PartialResult
-from service.audit.record.rows import EventRow, head, plain, read_rows
+from service.audit.record.rows import EventRow, head, plain, plain_payload, read_rows
 from service.audit.record.search import artefacts_of_events, one_artefact
 from service.computations import job_kinds
 from service.core.jobs import Each, Reference, references_in
 from service.core.records.events import FilesKept, JobEnqueued
+from service.store.event_index import cut_words, phrase
 from service.store.events import parse_canonical
 from service.store.records import Artefact
 from service.store.store import Store
@@ -103,16 +104,17 @@ def _step(store: Store, run_id: str, before: Graph | None) -> PartialResult[Grap
 
 _FILES = (
     "SELECT a.seq, a.position, a.sha256, a.kind, a.step, a.attempt, a.device, i.kind AS event, "
-    "CASE i.kind WHEN 'job_finished' THEN (SELECT json_extract(e.payload, '$.job') FROM events AS e "
-    "WHERE e.run_id = a.run_id AND e.seq = a.seq) WHEN 'files_kept' THEN (SELECT json_extract(e.payload, '$.note') "
+    "CASE i.kind WHEN 'job_finished' THEN (SELECT f.value FROM event_facets AS f "
+    "WHERE f.run_id = a.run_id AND f.seq = a.seq AND f.name = 'job') WHEN 'files_kept' THEN (SELECT e.payload "
     "FROM events AS e WHERE e.run_id = a.run_id AND e.seq = a.seq) END AS how "
     "FROM artefacts AS a JOIN event_index AS i ON i.run_id = a.run_id AND i.seq = a.seq "
     "WHERE a.run_id = :run AND a.seq > :after AND a.seq <= :upto"
 )
 _JOBS = (
-    "SELECT i.seq, i.kind AS event, i.step, e.payload, json_extract(e.payload, '$.job') AS job, "
-    "json_extract(e.payload, '$.job_kind') AS kind "
+    "SELECT i.seq, i.kind AS event, i.step, e.payload, j.value AS job, k.value AS kind "
     "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
+    "LEFT JOIN event_facets AS j ON j.run_id = i.run_id AND j.seq = i.seq AND j.name = 'job' "
+    "LEFT JOIN event_facets AS k ON k.run_id = i.run_id AND k.seq = i.seq AND k.name = 'job_kind' "
     "WHERE i.run_id = :run AND i.kind IN ('job_enqueued', 'job_finished', 'job_failed') "
     "AND i.seq > :after AND i.seq <= :upto"
 )
@@ -128,7 +130,7 @@ def _add_file(graph: Graph, row: Any) -> None:
         _connect(graph, job, key)
     elif row.event == "files_kept":
         place = (row.step or "", row.attempt or 0, row.device)
-        if str(row.how or "").startswith(_KEPT_AS_IT_CAME):
+        if str(plain_payload(row.how).get("note") or "").startswith(_KEPT_AS_IT_CAME):
             graph.originals[place] = key
         elif place in graph.originals and graph.originals[place] != key:
             _connect(graph, graph.originals[place], key)
@@ -209,6 +211,7 @@ class Origin:
 
 
 LISTED = 50
+_AT_ONCE = 1000  # files
 
 
 def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
@@ -240,7 +243,7 @@ def _naming(connection: Connection, run_id: str, word: str, limit: int = LISTED)
             "SELECT i.seq FROM event_words AS w JOIN event_index AS i ON i.position = w.rowid "
             "WHERE w.event_words MATCH :match AND i.run_id = :run ORDER BY w.rowid LIMIT :limit"
         ),
-        {"run": plain(run_id), "match": f'"{plain(word).replace(chr(34), "")}"', "limit": limit},
+        {"run": plain(run_id), "match": phrase(cut_words(plain(word))), "limit": limit},
     ).scalars()
     return list(found)
 
@@ -261,14 +264,15 @@ def _ends(connection: Connection, run_id: str, jobs: Sequence[str]) -> Iterator[
 
 def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Artefact], int]:
     named = list(dict.fromkeys([*_HASH.findall(job.shown), *_listed(connection, run_id, job)]))
-    rows = connection.execute(
-        text(
-            "SELECT min(seq * 1000 + position) AS place FROM artefacts WHERE run_id = :run "
-            "AND sha256 IN (SELECT value FROM json_each(:named)) GROUP BY sha256 ORDER BY 1"
-        ),
-        {"run": plain(run_id), "named": "[" + ",".join(f'"{sha256}"' for sha256 in named) + "]"},
-    ).scalars()
-    places = list(rows)
+    first_record = text(
+        "SELECT min(seq * 1000 + position) AS place FROM artefacts WHERE run_id = :run "
+        "AND sha256 IN :named GROUP BY sha256"
+    ).bindparams(bindparam("named", expanding=True))
+    places: list[int] = []
+    for start in range(0, len(named), _AT_ONCE):
+        values = {"run": plain(run_id), "named": named[start : start + _AT_ONCE]}
+        places += connection.execute(first_record, values).scalars()
+    places.sort()
     first = artefacts_of_events(connection, run_id, sorted({place // 1000 for place in places[:LISTED]}))
     return [row for row in first if row.ref.sha256 in set(named)][:LISTED], len(places)
 

@@ -15,12 +15,13 @@ from functools import cached_property
 from math import inf
 from typing import Any
 
-from sqlalchemy import Row, func, select
+from sqlalchemy import ColumnElement, Row, select
 
 from service.core.records.events import SignInRecorded
 from service.people.person import Person
 from service.people.rows import SERVICE
-from service.store.database.tables import event_index, events
+from service.store.database.tables import event_facets, event_index, events
+from service.store.event_index import facet_value
 from service.store.events import to_event
 from service.store.records import SITE
 from service.store.store import Store
@@ -32,6 +33,22 @@ REMEMBERED_S = 6 * 3600.0  # how long a wrong password of a known person counts
 _PLACE = (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
 _OF_SITE = select(events).join(event_index, _PLACE).where(event_index.c.run_id == SITE)
 _AT_ONCE = 200  # rows
+
+
+def _has(name: str, value: str) -> ColumnElement[bool]:
+    """Return the condition that an event of the index has this facet."""
+    facet = event_facets.alias()
+    return (
+        select(facet.c.seq)
+        .where(
+            facet.c.run_id == event_index.c.run_id,
+            facet.c.seq == event_index.c.seq,
+            facet.c.name == name,
+            facet.c.value == facet_value(value),
+        )
+        .correlate(event_index)
+        .exists()
+    )
 
 
 def wait_after_s(failures: int) -> float:
@@ -110,9 +127,7 @@ class KnownTries:
         """Return whether an administrator has ended the account's waits since; perhaps from another process."""
         ended = (
             _OF_SITE.where(
-                event_index.c.kind == "account_changed",
-                func.json_extract(events.c.payload, "$.field") == "lock_out",
-                func.json_extract(events.c.payload, "$.account") == account,
+                event_index.c.kind == "account_changed", _has("field", "lock_out"), _has("account", account)
             )
             .order_by(events.c.seq.desc())
             .limit(1)
@@ -124,16 +139,23 @@ class KnownTries:
     @cached_property
     def _addresses(self) -> set[tuple[str, str]]:
         """(account, address) of every sign-in that succeeded."""
-        payload = events.c.payload
-        named = select(func.json_extract(payload, "$.account"), func.json_extract(payload, "$.address")).distinct()
-        signed_in = named.join(event_index, _PLACE).where(
-            event_index.c.run_id == SITE,
-            event_index.c.kind == "sign_in_recorded",
-            event_index.c.actor != SERVICE,
-            func.json_extract(payload, "$.outcome") == "signed_in",
+        account, address = event_facets.alias(), event_facets.alias()
+        signed_in = (
+            select(account.c.value, address.c.value)
+            .distinct()
+            .join(event_index, (event_index.c.run_id == account.c.run_id) & (event_index.c.seq == account.c.seq))
+            .join(address, (address.c.run_id == account.c.run_id) & (address.c.seq == account.c.seq))
+            .where(
+                account.c.run_id == SITE,
+                account.c.name == "account",
+                address.c.name == "address",
+                event_index.c.kind == "sign_in_recorded",
+                event_index.c.actor != SERVICE,
+                _has("outcome", "signed_in"),
+            )
         )
         with self._store.database.reading() as connection:
-            return {(str(account), str(address)) for account, address in connection.execute(signed_in) if address}
+            return {(str(one), str(other)) for one, other in connection.execute(signed_in) if other}
 
     @cached_property
     def _failed(self) -> dict[tuple[str, str, str], deque[float]]:
@@ -179,9 +201,7 @@ def _first_start(store: Store) -> float:
     boot = store.clock.boot()
     if not boot:
         return inf
-    start = _OF_SITE.where(
-        event_index.c.kind == "service_started", func.json_extract(events.c.payload, "$.boot") == boot
-    )
+    start = _OF_SITE.where(event_index.c.kind == "service_started", _has("boot", boot))
     with store.database.reading() as connection:
         first = connection.execute(start.order_by(events.c.seq).limit(1)).first()
     return inf if first is None else float(first.seq)

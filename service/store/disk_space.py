@@ -20,6 +20,7 @@ from service.core.run.state import RunState
 from service.store.artefacts import TEMPORARY, alone_with, hash_file, relative_path
 from service.store.database.tables import artefacts, event_index, events, jobs, leases
 from service.store.durable_effects import Clock, utc_text
+from service.store.event_index import facet_value
 from service.store.runs import identity_of
 from service.store.store import Store
 
@@ -103,11 +104,16 @@ def _before(connection: Connection, run_id: str, protocol_id: str, *, simulated:
     """Return the usage of the newest other run of the protocol with photographs; None if there is none."""
     rows = connection.execute(
         text(
-            "SELECT r.run_id FROM runs AS r JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 "
-            "WHERE e.kind = 'run_started' AND r.simulated = :simulated AND r.run_id != :run "
-            "AND json_extract(e.payload, '$.protocol_id') = :protocol ORDER BY r.created_utc DESC LIMIT :most"
+            "SELECT r.run_id FROM runs AS r JOIN event_facets AS f ON f.run_id = r.run_id AND f.seq = 1 "
+            "WHERE f.name = 'protocol_id' AND f.value = :protocol AND r.simulated = :simulated AND r.run_id <> :run "
+            "ORDER BY r.created_utc DESC LIMIT :most"
         ),
-        {"simulated": int(simulated), "run": run_id, "protocol": protocol_id, "most": _LOOKED_AT},
+        {
+            "simulated": int(simulated),
+            "run": run_id,
+            "protocol": facet_value(protocol_id),
+            "most": _LOOKED_AT,
+        },
     )
     usages = (read_usage(connection, row.run_id) for row in rows.all())
     return next((usage for usage in usages if usage.views), None)

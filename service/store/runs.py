@@ -11,14 +11,15 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 import psutil
-from sqlalchemy import Connection, Row, bindparam, case, delete, func, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from service.core.errors import StoreError
 from service.core.records.events import RunStarted, SiteOpened
 from service.store.artefacts import ArtefactFiles, insert_artefacts
 from service.store.database.engine import Database
-from service.store.database.tables import event_index, events, heads, leases, runs
+from service.store.database.tables import event_facets, event_index, heads, leases, runs
 from service.store.durable_effects import Clock, IdSource, SystemClock
+from service.store.event_index import OF_FACET
 from service.store.events import ROOT, append
 from service.store.records import SITE, LeaseHeldError, LeaseLostError, NewArtefact, RunRow, UnknownRunError
 
@@ -73,15 +74,13 @@ def read_open_runs(connection: Connection) -> set[str]:
         .exists()
     )
     aborted = (
-        select(events.c.seq)
+        select(event_facets.c.seq)
+        .join(event_index, OF_FACET)
         .where(
-            events.c.run_id == heads.c.run_id,
-            events.c.seq == event_index.c.seq,
-            event_index.c.run_id == heads.c.run_id,
+            event_facets.c.run_id == heads.c.run_id,
+            event_facets.c.name == "action",
+            event_facets.c.value == "abort",
             event_index.c.kind == "operator_action",
-            # A damaged payload must not raise here; the verification finds it.
-            case((func.json_valid(events.c.payload) == 1, func.json_extract(events.c.payload, "$.action")))
-            == "abort",
         )
         .correlate(heads)
         .exists()

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 import tarfile
 from pathlib import Path
 
 import pytest
 
+from service.audit.filters import EventFilter
 from service.audit.record.run import read_run
+from service.audit.record.search import events_page
 from service.audit.replay.replay import replay
 from service.core.records.events import JobEnqueued, StepMeasured
 from service.steps.protocol_check import measures_of
+from service.store.store import Store
 from service.store.verification.verify import verify
 
 RECORDED = Path(__file__).parents[1] / "data" / "recorded"
@@ -63,3 +67,23 @@ def test_its_computations_give_the_same_again(data: Path) -> None:
     assert report.verdict in ("identical", "within_tolerance")
     assert {job.kind for job in report.jobs} == set(kinds)
     assert not any(gate.changed for gate in report.gates)
+
+
+def test_reading_leaves_the_older_database_as_it_was(data: Path) -> None:
+    database = data / "orthocapture.sqlite"
+    before = database.read_bytes()
+    assert verify(data).ok
+    assert read_run(data, "latest").state.status == "completed"
+    assert database.read_bytes() == before
+
+
+def test_it_is_upgraded_when_it_is_opened_for_writing(data: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(data, tmp_path / "data"))
+    with Store.open(folder) as store:
+        run_id = store.find_run("latest")
+        with store.database.reading() as connection:
+            for words, found in (("register", True), ("Registér", True), ("no-such-word", False)):
+                page = events_page(connection, run_id, EventFilter(q=words))
+                assert bool(page.rows) is found, words
+    report = verify(folder)
+    assert report.ok, report.faults

@@ -33,7 +33,7 @@ from service.store.verification.verify import verify
 from tests.support.record.counting import lines_of
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run, tamper
-from tests.support.record.tampering import WORDS_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
+from tests.support.record.tampering import INDEX_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 
@@ -70,7 +70,7 @@ def sign_again(data: Path) -> None:
 
 def deleted(run: str) -> list[str]:
     tables = ("checkpoints", "artefacts", "event_index", "heads", "events", "runs")
-    return [*(f"DELETE FROM {table} WHERE run_id = '{run}'" for table in tables), *WORDS_AGAIN]
+    return [*(f"DELETE FROM {table} WHERE run_id = '{run}'" for table in tables), *INDEX_AGAIN]
 
 
 def forge(data: Path) -> None:
@@ -81,7 +81,7 @@ def forge(data: Path) -> None:
         data,
         f"UPDATE event_index SET actor = 'Eve' WHERE run_id = '{run}'",
         *without_signatures_from(run, 1),
-        *WORDS_AGAIN,
+        *INDEX_AGAIN,
     )
 
 

@@ -16,7 +16,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import rows, tamper
-from tests.support.record.tampering import WORDS_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
+from tests.support.record.tampering import INDEX_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 UNSIGNED = PROTOCOL.replace(
@@ -61,7 +61,7 @@ def forge(data: Path, run: str) -> list[int]:
         *without_signatures_from(run, 1),
         *cut(SITE, int(str(site_seq))),
         *COUNTED_AGAIN,
-        *WORDS_AGAIN,
+        *INDEX_AGAIN,
     )
     lines = (data / NAME).read_bytes().splitlines(keepends=True)
     first = next(at for at, line in enumerate(lines) if json.loads(line)["checkpoint"]["run_id"] == run)

@@ -25,7 +25,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, rows, start_run, tamper
-from tests.support.record.tampering import WORDS_AGAIN, alter_row, journal_anew, rewrite_to_the_end
+from tests.support.record.tampering import INDEX_AGAIN, alter_row, journal_anew, rewrite_to_the_end
 
 ROOT_DIR = Path(__file__).parents[2]
 RUN = "20261121-120000-000003"
@@ -143,7 +143,7 @@ def test_the_sites_chain_is_protected_by_the_runs(store: Store) -> None:
         "DELETE FROM event_index WHERE run_id = 'site' AND seq >= 3",
         "UPDATE heads SET seq = 2, sha256 = (SELECT sha256 FROM events WHERE run_id = 'site' AND seq = 2) "
         "WHERE run_id = 'site'",
-        *WORDS_AGAIN,
+        *INDEX_AGAIN,
     )
     journal_anew(folder(store))
     found = faults(store, RUN)

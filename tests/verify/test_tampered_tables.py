@@ -69,9 +69,8 @@ def run_of(data: Path) -> str:
     return str(run)
 
 
-WORDS = "coalesce((SELECT group_concat(atom, ' ') FROM json_tree(e.payload) WHERE type = 'text'), '')"
 FORGET = (
-    f"INSERT INTO event_words (event_words, rowid, words) SELECT 'delete', i.position, e.actor || ' ' || {WORDS} "
+    "INSERT INTO event_words (event_words, rowid, words) SELECT 'delete', i.position, words_of(e.actor, e.payload) "
     "FROM events AS e JOIN event_index AS i USING (run_id, seq) WHERE e.kind = 'viewpoint_captured'"
 )
 ALTERED = {
@@ -88,6 +87,23 @@ ALTERED = {
     "no words at all": (
         "INSERT INTO event_words (event_words) VALUES ('delete-all')",
         "event 1: the words by which auditors search",
+    ),
+    "a protocol that no page finds any more": (
+        "DELETE FROM event_facets WHERE name = 'protocol_id'",
+        "event 1: the index of events does not say what the event says",
+    ),
+    "another protocol": (
+        "UPDATE event_facets SET value = 'other' WHERE name = 'protocol_id'",
+        "event 1: the index of events does not say what the event says",
+    ),
+    "a value that the event does not have": (
+        "INSERT INTO event_facets SELECT run_id, seq, 'action', 'abort' FROM events "
+        "WHERE kind = 'viewpoint_captured'",
+        "event 2: the index of events does not say what the event says",
+    ),
+    "a value of no event": (
+        "INSERT INTO event_facets SELECT run_id, 999, 'action', 'abort' FROM runs WHERE run_id <> 'site'",
+        "event 999: the index of events has facets of an event that is not there",
     ),
     "the order of events": (
         "UPDATE event_index SET position = 999 WHERE kind = 'run_started'",

@@ -16,6 +16,7 @@ from bench.torture.audit.record import Record, put_back
 from bench.torture.audit.tally import Tallies, Tally
 from service.store.database.engine import database_path
 from service.store.database.tables import metadata
+from service.store.event_index import cut_words
 
 TABLES = (*metadata.tables, "alembic_version")
 
@@ -142,7 +143,8 @@ def _of_words(connection: sqlite3.Connection) -> Iterator[Edit]:
     delete = "INSERT INTO event_words (event_words, rowid, words) VALUES ('delete', ?, ?)"
     for place, actor in connection.execute("SELECT position, actor FROM event_index").fetchall():
         yield Edit("row inserted", f"words of event {place}", "event_words +row", ((insert, (place, "accept")),))
-        yield Edit("row deleted", f"the actor of event {place}", "event_words -row", ((delete, (place, actor)),))
+        words = " ".join(cut_words(actor))
+        yield Edit("row deleted", f"the actor of event {place}", "event_words -row", ((delete, (place, words)),))
     yield Edit("row inserted", "words of no event", "event_words +row", ((insert, (9999, "accept")),))
     everything = "INSERT INTO event_words (event_words) VALUES ('delete-all')"
     yield Edit("row deleted", "every word", "event_words -row", ((everything, ()),))

@@ -29,7 +29,8 @@ from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import RowsDigest, key_fingerprint, public_bytes
 from service.store.signatures.checkpoints import statement as signed_text
 from service.store.signatures.log import NAME, LogEnd, SignatureLog
-from tests.support.record.tampering import WORDS_AGAIN
+from tests.support.record.store import know_index
+from tests.support.record.tampering import INDEX_AGAIN
 
 CAN_WRITE = ("database", "site's chain", "journal", "log", "second place")
 KEYS = ("no key", "a key of his own", "the key in use", "every key")
@@ -140,6 +141,7 @@ class _Forger:
     # --- database ---
 
     def _in_database(self, connection: sqlite3.Connection, run_id: str, seq: int) -> None:
+        know_index(connection)
         triggers = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
         connection.execute("BEGIN")
         for name, _sql in triggers:
@@ -151,7 +153,7 @@ class _Forger:
         self._sign_again(connection, run_id, seq)
         if "site's chain" in self._can:
             self._rewrite_site(connection, run_id, seq)
-        for statement in WORDS_AGAIN:
+        for statement in INDEX_AGAIN:
             connection.execute(statement)
         for _name, sql in triggers:
             connection.execute(sql)

@@ -35,10 +35,10 @@ def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[OpenedDe
     """Return serial numbers of the cameras among the opened devices."""
     rows = connection.execute(
         text(
-            "SELECT DISTINCT json_extract(e.payload, '$.camera.body_serial') AS body "
-            "FROM (SELECT seq FROM event_index WHERE run_id = :run "
+            "SELECT DISTINCT f.value AS body FROM (SELECT seq FROM event_index WHERE run_id = :run "
             "AND kind IN ('viewpoint_captured', 'view_held', 'view_imported') "
-            "ORDER BY seq DESC LIMIT :most) AS i JOIN events AS e ON e.run_id = :run AND e.seq = i.seq ORDER BY 1"
+            "ORDER BY seq DESC LIMIT :most) AS i JOIN event_facets AS f ON f.run_id = :run AND f.seq = i.seq "
+            "AND f.name = 'body_serial' ORDER BY 1"
         ),
         {"run": plain(run_id), "most": _LOOKED_AT},
     ).all()
@@ -72,11 +72,13 @@ def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
     """
     rows = connection.execute(
         text(
-            "WITH i AS (SELECT run_id, seq, step, kind, sum(kind = 'session_started') OVER (ORDER BY seq) AS start "
+            "WITH i AS (SELECT run_id, seq, step, kind, "
+            "sum(CASE WHEN kind = 'session_started' THEN 1 ELSE 0 END) OVER (ORDER BY seq) AS start "
             "FROM event_index WHERE run_id = :run AND kind IN ('viewpoint_captured', 'session_started')), "
-            "c AS (SELECT i.step, i.start, i.seq, e.monotonic_s AS at, "
-            "json_extract(e.payload, '$.clock_offset_s') AS o "
-            "FROM i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq WHERE i.kind = 'viewpoint_captured') "
+            "c AS (SELECT i.step, i.start, i.seq, e.monotonic_s AS at, CAST(f.value AS DOUBLE PRECISION) AS o "
+            "FROM i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
+            "LEFT JOIN event_facets AS f ON f.run_id = i.run_id AND f.seq = i.seq AND f.name = 'clock_offset_s' "
+            "WHERE i.kind = 'viewpoint_captured') "
             "SELECT step, start, count(*) AS n, min(seq) AS first, max(seq) AS last, min(o) AS low, max(o) AS high, "
             "max(at) - min(at) AS over FROM c GROUP BY step, start ORDER BY min(seq)"
         ),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from pydantic import TypeAdapter
+from pydantic_core import from_json
 from sqlalchemy import Connection, text
 
 from service.audit.background import IncrementalResults, PartialResult
@@ -38,7 +39,19 @@ _JOB_KINDS = (evaluate.KIND.name,)
 
 # The fold needs only step, attempt and viewpoint of these events.
 _VIEWS = {kind: payload for kind, payload in RUN_EVENTS.items() if issubclass(payload, RecordedView)}
-_PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
+_SHORTENED = ("step_measured", "job_finished", "job_enqueued")
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """The view that an event is about."""
+
+    step: str
+    attempt: int
+    viewpoint: str
+
+
+_PLACE = TypeAdapter(_Place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,26 +169,14 @@ def _quoted(kinds: Sequence[str]) -> str:
     return ", ".join(f"'{kind}'" for kind in kinds)
 
 
-# Of a result, only the evaluation's table is needed; its files are not.
-_WITH_TABLE_ALONE = (
-    "json_set(json_remove(payload, '$.artefacts'), '$.result', CASE json_type(payload, '$.result.table') "
-    "WHEN 'array' THEN json_object('table', json_extract(payload, '$.result.table')) ELSE json('{}') END)"
-)
-
-
 def _rows(connection: Connection, run_id: str, after: int, upto: int) -> Sequence[Any]:
     return connection.execute(
         text(
-            "SELECT seq, kind, at_utc, monotonic_s, actor, previous_sha256, sha256, CASE "
-            f"WHEN kind IN ('step_measured', 'job_finished') THEN {_WITH_TABLE_ALONE} "
-            "WHEN kind = 'job_enqueued' THEN json_set(payload, '$.arguments', json('{}')) "
-            f"WHEN kind IN ({_quoted(tuple(_VIEWS))}) THEN json_array(json_extract(payload, '$.step'), "
-            "json_extract(payload, '$.attempt'), json_extract(payload, '$.viewpoint')) "
-            "ELSE payload END AS payload FROM events "
+            "SELECT seq, kind, at_utc, monotonic_s, actor, payload, previous_sha256, sha256 FROM events AS e "
             f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND (kind IN ({_quoted(DECISIVE_EVENTS)}) "
-            f"OR kind IN ({_quoted(_JOB_EVENTS)}) "
-            f"AND json_extract(payload, '$.job_kind') IN ({_quoted(_JOB_KINDS)})) "
-            "ORDER BY seq"
+            f"OR kind IN ({_quoted(_JOB_EVENTS)}) AND EXISTS (SELECT 1 FROM event_facets AS f "
+            "WHERE f.run_id = e.run_id AND f.seq = e.seq AND f.name = 'job_kind' "
+            f"AND f.value IN ({_quoted(_JOB_KINDS)}))) ORDER BY seq"
         ),
         {"run": run_id, "after": after, "upto": upto},
     ).all()
@@ -216,11 +217,22 @@ def _advance(digest: Digest, row: Any) -> None:
 
 
 def _payload(kind: str, content: str) -> Payload:
-    if kind not in _VIEWS:
+    """Return the payload of an event without the parts that no digest needs, which may be large."""
+    if kind in _VIEWS:
+        place = _PLACE.validate_json(content)
+        view = _VIEWS[kind].model_construct(step=place.step, attempt=place.attempt, viewpoint=place.viewpoint)
+        return cast("Payload", view)
+    if kind not in _SHORTENED:
         return PAYLOAD.validate_json(content)
-    step, attempt, viewpoint = _PLACE.validate_json(content)
-    view = _VIEWS[kind].model_construct(step=step, attempt=attempt, viewpoint=viewpoint)
-    return cast("Payload", view)
+    fields: dict[str, Any] = from_json(content)
+    if kind == "job_enqueued":
+        fields["arguments"] = {}
+    else:  # of a result, only the evaluation's table is needed; its files are not
+        fields.pop("artefacts", None)
+        result = fields.get("result")
+        table: object = result.get("table") if isinstance(result, Mapping) else None
+        fields["result"] = {"table": table} if isinstance(table, list) else {}
+    return PAYLOAD.validate_python(fields)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -20,8 +20,25 @@ from service.core.text.files import parse_json
 from service.core.text.words import reason_of
 from service.store.store import Store
 
-_UNCERTAINTIES = TypeAdapter(dict[str, Uncertainty])
-_MEASURES = TypeAdapter(dict[str, float])
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """What is shown of a step_measured event."""
+
+    attempt: int
+    measures: Mapping[str, float] = field(default_factory=dict[str, float])
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
+
+    def texts(self) -> Mapping[str, str]:
+        """Return the measures as texts, with their bounds if they have any."""
+        known = self.uncertainties
+        return {
+            name: uncertain(value, known[name].lower, known[name].upper) if name in known else quantity(value)
+            for name, value in self.measures.items()
+        }
+
+
+_MEASURED = TypeAdapter(_Measured)
 LISTED = 200  # most rows of a list; the timeline has the rest
 
 
@@ -120,9 +137,7 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
     """Return the steps with a superseded or retried attempt, in the protocol's order."""
     rows = connection.execute(
         text(
-            "SELECT e.seq, e.at_utc, i.step, json_extract(e.payload, '$.attempt') AS attempt, "
-            "json_extract(e.payload, '$.measures') AS measures, "
-            "json_extract(e.payload, '$.uncertainties') AS uncertainties "
+            "SELECT e.seq, e.at_utc, i.step, e.payload "
             "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
             "WHERE i.run_id = :run AND i.kind = 'step_measured' ORDER BY i.seq DESC LIMIT :limit"
         ),
@@ -130,9 +145,8 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
     ).all()
     measured: dict[str, list[Attempt]] = {}
     for row in reversed(rows):
-        measured.setdefault(row.step, []).append(
-            Attempt(row.attempt, row.seq, row.at_utc, _numbers(row.measures, row.uncertainties))
-        )
+        attempt = _MEASURED.validate_json(row.payload)
+        measured.setdefault(row.step, []).append(Attempt(attempt.attempt, row.seq, row.at_utc, attempt.texts()))
     if digest.state is None:
         return []
     reasons: dict[str, list[tuple[int, str]]] = {}
@@ -144,15 +158,6 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
         for name in digest.state.steps
         if len(measured.get(name, [])) > 1 or name in reasons
     ]
-
-
-def _numbers(measures: str | None, uncertainties: str | None) -> Mapping[str, str]:
-    known = _UNCERTAINTIES.validate_json(uncertainties or "{}")
-    values = _MEASURES.validate_json(measures or "{}")
-    return {
-        name: uncertain(value, known[name].lower, known[name].upper) if name in known else quantity(value)
-        for name, value in values.items()
-    }
 
 
 @dataclass(frozen=True, slots=True)

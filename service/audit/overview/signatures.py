@@ -35,13 +35,11 @@ def signatures(connection: Connection, run_id: str, digest: Digest | None) -> li
 
     With `digest`, also whether each is still valid.
     """
-    # The word index narrows the actions down before any payload is read.
     seqs = connection.execute(
         text(
-            "SELECT i.seq FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
-            "WHERE i.run_id = :run AND i.kind = 'operator_action' AND i.position IN "
-            '(SELECT rowid FROM event_words WHERE event_words MATCH \'"sign" OR "accept"\') '
-            "AND json_extract(e.payload, '$.action') IN ('sign', 'accept') "
+            "SELECT i.seq FROM event_index AS i JOIN event_facets AS f ON f.run_id = i.run_id AND f.seq = i.seq "
+            "WHERE i.run_id = :run AND i.kind = 'operator_action' AND f.name = 'action' "
+            "AND f.value IN ('sign', 'accept') "
             "UNION SELECT seq FROM event_index WHERE run_id = :run AND kind = 'run_released' "
             "ORDER BY 1 LIMIT :limit"
         ),

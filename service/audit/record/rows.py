@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, text
+from pydantic_core import from_json
+from sqlalchemy import Connection, bindparam, text
 
 from service.core.errors import IntegrityError
 from service.core.records.base import Record
@@ -42,37 +43,44 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
     """Return all runs, newest first; or the run of this name, if there is one."""
     rows = connection.execute(
         text(
-            "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, "
-            "json_extract(e.payload, '$.protocol_id') AS protocol, "
-            "json_extract(e.payload, '$.protocol_version') AS version, "
-            "json_extract(e.payload, '$.operator') AS operator, "
-            "json_extract(e.payload, '$.origin') AS origin, json_extract(e.payload, '$.about') AS about "
+            "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, e.payload "
             "FROM runs AS r LEFT JOIN heads AS h ON h.run_id = r.run_id "
-            "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
+            "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 "
             "WHERE r.run_id <> :site AND (:run IS NULL OR r.run_id = :run) ORDER BY r.created_utc DESC, r.run_id DESC"
         ),
         {"site": SITE, "run": None if run_id is None else plain(run_id)},
     )
-    return [
-        RunBasics(
-            run_id=row.run_id,
-            created_utc=row.created_utc,
-            simulated=bool(row.simulated),
-            protocol=str(row.protocol or ""),
-            version=str(row.version or ""),
-            operator=str(row.operator or ""),
-            origin=str(row.origin or "captured"),
-            about=_about(row.about),
-            head_seq=row.seq or 0,
-            head_sha256=row.sha256 or "",
-        )
-        for row in rows
-    ]
+    return [_basics(row) for row in rows]
 
 
-def _about(content: str | None) -> RunAbout:
+def _basics(row: Any) -> RunBasics:
+    started = plain_payload(row.payload)
+    return RunBasics(
+        run_id=row.run_id,
+        created_utc=row.created_utc,
+        simulated=bool(row.simulated),
+        protocol=str(started.get("protocol_id") or ""),
+        version=str(started.get("protocol_version") or ""),
+        operator=str(started.get("operator") or ""),
+        origin=str(started.get("origin") or "captured"),
+        about=_about(started.get("about")),
+        head_seq=row.seq or 0,
+        head_sha256=row.sha256 or "",
+    )
+
+
+def plain_payload(content: str | None) -> dict[str, Any]:
+    """Return the plain data of a payload; empty if it is missing or altered, which the verification reports."""
     try:
-        return RunAbout.model_validate_json(content) if content else RunAbout()
+        fields: object = from_json(content or "{}")
+    except ValueError:
+        return {}
+    return cast("dict[str, Any]", fields) if isinstance(fields, dict) else {}
+
+
+def _about(content: object) -> RunAbout:
+    try:
+        return RunAbout.model_validate(content or {})
     except ValidationError:  # the verification reports it
         return RunAbout()
 
@@ -134,21 +142,22 @@ class EventRow:
             return None
 
 
-_ROW = (
-    "SELECT e.seq, e.at_utc, e.monotonic_s, e.actor, e.kind, e.previous_sha256, e.sha256, length(e.payload) AS size, "
-    "CASE WHEN length(e.payload) <= :inline THEN e.payload WHEN json_valid(e.payload) THEN "
-    "(SELECT json_group_object(j.key, json(json_quote(j.value))) FROM json_each(e.payload) AS j "
-    "WHERE j.type NOT IN ('object', 'array')) END AS payload, "
+_ROW = text(
+    "SELECT e.seq, e.at_utc, e.monotonic_s, e.actor, e.kind, e.payload, e.previous_sha256, e.sha256, "
     "(SELECT count(*) FROM artefacts AS a WHERE a.run_id = e.run_id AND a.seq = e.seq) AS artefacts "
-    "FROM events AS e WHERE e.run_id = :run AND e.seq IN (SELECT value FROM json_each(:seqs)) ORDER BY e.seq"
-)
+    "FROM events AS e WHERE e.run_id = :run AND e.seq IN :seqs ORDER BY e.seq"
+).bindparams(bindparam("seqs", expanding=True))
+_AT_ONCE = 1000  # events
 
 
 def read_rows(connection: Connection, run_id: str, seqs: Sequence[int], *, whole: bool = False) -> list[EventRow]:
-    """Return these events; unless `whole`, long payloads lack their lists and tables."""
-    inline = LARGEST_SEQ if whole else _INLINE_CHARACTERS
-    values = {"run": plain(run_id), "seqs": json.dumps(list(seqs)), "inline": inline}
-    return [_event_row(row, whole=row.size <= inline) for row in connection.execute(text(_ROW), values)]
+    """Return these events in order; unless `whole`, long payloads lack their lists and tables."""
+    wanted, inline = sorted(set(seqs)), LARGEST_SEQ if whole else _INLINE_CHARACTERS
+    return [
+        _event_row(row, whole=len(row.payload) <= inline)
+        for start in range(0, len(wanted), _AT_ONCE)
+        for row in connection.execute(_ROW, {"run": plain(run_id), "seqs": wanted[start : start + _AT_ONCE]})
+    ]
 
 
 def one_event(connection: Connection, run_id: str, seq: int) -> EventRow:
@@ -162,7 +171,9 @@ def one_event(connection: Connection, run_id: str, seq: int) -> EventRow:
 
 def _event_row(row: Any, *, whole: bool) -> EventRow:
     try:
-        payload: dict[str, Any] = parse_canonical(row.payload or "null") or {}
+        payload: dict[str, Any] = parse_canonical(row.payload) or {}
+        if not whole:
+            payload = {name: value for name, value in payload.items() if not isinstance(value, list | dict)}
         shown = json.dumps(payload, indent=1, ensure_ascii=False, sort_keys=True) if whole else ""
         line = headline(payload)
     except (ValueError, AttributeError):  # altered: shown unchanged
@@ -177,7 +188,7 @@ def _event_row(row: Any, *, whole: bool) -> EventRow:
         step=step if isinstance(step, str) else "",
         attempt=attempt if isinstance(attempt, int) else None,
         summary=line,
-        size=row.size,
+        size=len(row.payload),
         shown=shown,
         payload=payload,
         previous_sha256=row.previous_sha256,
@@ -242,10 +253,10 @@ def seqs_of_kind(
     order = "DESC" if newest else "ASC"
     found = connection.execute(
         text(
-            "SELECT seq FROM event_index WHERE run_id = :run AND kind IN (SELECT value FROM json_each(:kinds)) "
+            "SELECT seq FROM event_index WHERE run_id = :run AND kind IN :kinds "
             f"ORDER BY +seq {order} LIMIT :limit"  # "+": use the index on the kind, which has few rows
-        ),
-        {"run": plain(run_id), "kinds": json.dumps(list(kinds)), "limit": limit},
+        ).bindparams(bindparam("kinds", expanding=True)),
+        {"run": plain(run_id), "kinds": list(kinds), "limit": limit},
     ).scalars()
     return sorted(found)
 

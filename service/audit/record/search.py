@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Connection, text
+from sqlalchemy import Connection, bindparam, text
 
 from service.audit.filters import ArtefactFilter, EventFilter
 from service.audit.record.rows import LARGEST_SEQ, PAGE, EventRow, head, plain, read_rows
 from service.store.artefacts import to_artefact
+from service.store.event_index import cut_words, phrase
 from service.store.records import Artefact, UnknownRunError
 
 COUNT_LIMIT = 10_000  # matches of a filter beyond this number are not counted
 _SEARCH_CHARACTERS = 200
 _SEARCH_TERMS = 8
-_WORD = re.compile(r"[^\W_]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +32,9 @@ class EventPage:
 
 
 def search_expression(q: str) -> str | None:
-    """Return a person's words as an FTS5 expression that matches every word as a prefix; None if there is no word."""
-    words = plain(q)[:_SEARCH_CHARACTERS].replace("\0", " ").replace('"', " ").split()
-    terms = [word for word in words if _WORD.search(word)][:_SEARCH_TERMS]
-    return " AND ".join(f'"{term}"*' for term in terms) or None
+    """Return a person's words as an expression that matches each as a beginning; None if there is no word."""
+    terms = [cut for word in plain(q)[:_SEARCH_CHARACTERS].split() if (cut := cut_words(word))]
+    return " AND ".join(phrase(words, beginning=True) for words in terms[:_SEARCH_TERMS]) or None
 
 
 def events_page(
@@ -104,7 +102,7 @@ def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[st
     if wanted.q:
         match = search_expression(wanted.q)
         if match is None:
-            conditions.append("0")
+            conditions.append("1 = 0")
         else:
             conditions.append(
                 "i.position IN (SELECT rowid FROM event_words "
@@ -256,10 +254,9 @@ def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]
         return []
     rows = connection.execute(
         text(
-            f"SELECT {_COLUMNS} FROM artefacts WHERE run_id = :run AND seq IN (SELECT value FROM json_each(:seqs)) "
-            "ORDER BY seq, position LIMIT 1000"
-        ),
-        {"run": plain(run_id), "seqs": str(list(seqs))},
+            f"SELECT {_COLUMNS} FROM artefacts WHERE run_id = :run AND seq IN :seqs ORDER BY seq, position LIMIT 1000"
+        ).bindparams(bindparam("seqs", expanding=True)),
+        {"run": plain(run_id), "seqs": list(seqs)},
     )
     return [to_artefact(row) for row in rows]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Literal
 from sqlalchemy import Connection, text
 
 from service.audit.filters import RunSearch
+from service.audit.record.rows import plain_payload
 from service.audit.runs.search import FoundRun, find_runs
 from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_identity, recorded_optics
 from service.store.store import Store
@@ -134,43 +134,33 @@ class _CalibrationResult:
     robots: tuple[str, ...]
 
 
+_OF_KIND = text(
+    "SELECT e.run_id, e.at_utc, e.payload FROM runs AS r CROSS JOIN event_index AS i CROSS JOIN events AS e "
+    "WHERE i.run_id = r.run_id AND i.kind = :kind AND e.run_id = i.run_id AND e.seq = i.seq "
+    "AND e.payload LIKE :word ORDER BY e.run_id, e.seq"
+)
+
+
 def _calibrations(connection: Connection) -> dict[str, tuple[_CalibrationResult, ...]]:
-    rows = connection.execute(
-        text(
-            "SELECT e.run_id, e.at_utc, json_extract(e.payload, '$.step') AS step, "
-            "json_extract(e.payload, '$.measures') AS measures, "
-            "json_extract(e.payload, '$.result.camera') AS camera, "
-            "json_extract(e.payload, '$.result.robots') AS robots FROM runs AS r CROSS JOIN event_index AS i "
-            "ON i.run_id = r.run_id AND i.kind = 'step_measured' CROSS JOIN events AS e "
-            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) "
-            "AND json_type(e.payload, '$.result.camera') = 'object' ORDER BY e.run_id, e.seq"
-        )
-    )
     found: dict[str, dict[str, _CalibrationResult]] = defaultdict(dict)
-    for row in rows:
-        measures = _numbers(row.measures)
-        if any(name in measures for name in _MEASURED):
-            robots = json.loads(row.robots) if row.robots else []
-            found[row.run_id][str(row.step)] = _CalibrationResult(
-                row.at_utc, measures, _numbers(row.camera), tuple(map(str, robots))
+    for row in connection.execute(_OF_KIND, {"kind": "step_measured", "word": '%"camera":{%'}):
+        payload = plain_payload(row.payload)
+        measures, result = _numbers(payload.get("measures")), payload.get("result") or {}
+        if isinstance(result.get("camera"), dict) and any(name in measures for name in _MEASURED):
+            found[row.run_id][str(payload.get("step"))] = _CalibrationResult(
+                row.at_utc, measures, _numbers(result["camera"]), tuple(map(str, result.get("robots") or ()))
             )
     return {run: tuple(steps.values()) for run, steps in found.items()}
 
 
 def _devices(connection: Connection) -> dict[str, dict[str, RecordedIdentity]]:
     """Return by run and name in rig.yaml the identity that a device reported when it was last opened."""
-    rows = connection.execute(
-        text(
-            "SELECT e.run_id, json_extract(e.payload, '$.device') AS device, "
-            "json_extract(e.payload, '$.report.identity') AS identity FROM runs AS r CROSS JOIN event_index AS i "
-            "ON i.run_id = r.run_id AND i.kind = 'device_opened' CROSS JOIN events AS e "
-            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) "
-            "AND json_type(e.payload, '$.report.identity') = 'object' ORDER BY e.run_id, e.seq"
-        )
-    )
     found: dict[str, dict[str, RecordedIdentity]] = defaultdict(dict)
-    for row in rows:
-        found[row.run_id][str(row.device)] = recorded_identity(json.loads(row.identity))
+    for row in connection.execute(_OF_KIND, {"kind": "device_opened", "word": '%"identity":{%'}):
+        payload = plain_payload(row.payload)
+        identity = (payload.get("report") or {}).get("identity")
+        if isinstance(identity, dict):
+            found[row.run_id][str(payload.get("device"))] = recorded_identity(identity)
     return found
 
 
@@ -178,16 +168,17 @@ def _optics(connection: Connection) -> dict[str, RecordedOptics]:
     """Return by run what the first photograph states of camera and lens."""
     rows = connection.execute(
         text(
-            "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM runs AS r CROSS JOIN events AS e "
-            "ON e.run_id = r.run_id AND e.seq = (SELECT min(i.seq) FROM event_index AS i WHERE i.run_id = r.run_id "
-            "AND i.kind IN ('viewpoint_captured', 'view_held', 'view_imported')) WHERE json_valid(e.payload)"
+            "SELECT e.run_id, e.payload FROM runs AS r CROSS JOIN events AS e "
+            "WHERE e.run_id = r.run_id AND e.seq = (SELECT min(i.seq) FROM event_index AS i "
+            "WHERE i.run_id = r.run_id AND i.kind IN ('viewpoint_captured', 'view_held', 'view_imported'))"
         )
     )
-    return {row.run_id: recorded_optics(json.loads(row.camera)) for row in rows if row.camera}
+    stated = {row.run_id: plain_payload(row.payload).get("camera") for row in rows}
+    return {run: recorded_optics(camera) for run, camera in stated.items() if camera}
 
 
-def _numbers(content: str | None) -> dict[str, float]:
-    read: dict[str, object] = json.loads(content) if content else {}
+def _numbers(content: Mapping[str, object] | None) -> dict[str, float]:
+    read = content or {}
     return {name: float(v) for name, v in read.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
 

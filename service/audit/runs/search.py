@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from sqlalchemy import Connection, text
 
 from service.audit.filters import Result, RunSearch
-from service.audit.record.rows import RunBasics, runs
+from service.audit.record.rows import RunBasics, plain_payload, runs
 from service.core.records.events import GatesEvaluated
 from service.store.runs import read_open_runs
 from service.store.store import Store
@@ -85,14 +85,14 @@ def find_runs(store: Store, wanted: RunSearch) -> list[FoundRun]:
 
 def _every(connection: Connection) -> list[FoundRun]:
     still_open = read_open_runs(connection)
-    ended = {run for run, _ in _of_kind(connection, "run_completed", "'x'")}
-    released = {run for run, _ in _of_kind(connection, "run_released", "'x'")}
+    ended = {run for run, _ in _of_kind(connection, "run_completed")}
+    released = {run for run, _ in _of_kind(connection, "run_released")}
     notes: dict[str, list[str]] = defaultdict(list)
-    for run, said in _of_kind(connection, "note_taken", "json_extract(e.payload, '$.text')"):
-        notes[run].append(said)
-    judged = dict(
-        _of_kind(connection, "gates_evaluated", f"CASE WHEN e.payload LIKE '%{_ERROR}%' THEN e.payload END")
-    )
+    for run, payload in _of_kind(connection, "note_taken"):
+        said = plain_payload(payload).get("text")
+        if isinstance(said, str):
+            notes[run].append(said)
+    judged = dict(_of_kind(connection, "gates_evaluated", _ERROR))
     return [
         FoundRun(
             basics=run,
@@ -105,18 +105,18 @@ def _every(connection: Connection) -> list[FoundRun]:
     ]
 
 
-def _of_kind(connection: Connection, kind: str, shown: str) -> Sequence[tuple[str, str]]:
-    """Run and text of each event of a kind, in order; those without text are left out."""
+def _of_kind(connection: Connection, kind: str, word: str = "") -> Sequence[tuple[str, str]]:
+    """Return run and payload of each event of a kind whose payload has this word, in order."""
     rows = connection.execute(
         text(
             # Run by run, in the order of the index, to avoid reading every event of the folder.
-            f"SELECT i.run_id, {shown} AS shown FROM runs AS r CROSS JOIN event_index AS i "
-            "ON i.run_id = r.run_id AND i.kind = :kind CROSS JOIN events AS e "
-            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) ORDER BY i.run_id, i.seq"
+            "SELECT i.run_id, e.payload FROM runs AS r CROSS JOIN event_index AS i CROSS JOIN events AS e "
+            "WHERE i.run_id = r.run_id AND i.kind = :kind AND e.run_id = i.run_id AND e.seq = i.seq "
+            "AND e.payload LIKE :word ORDER BY i.run_id, i.seq"
         ),
-        {"kind": kind},
+        {"kind": kind, "word": f"%{word}%"},
     )
-    return [(str(row.run_id), str(row.shown)) for row in rows if row.shown]
+    return [(str(row.run_id), str(row.payload)) for row in rows]
 
 
 def _accuracy(payload: str) -> Accuracy | None:

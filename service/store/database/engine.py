@@ -11,6 +11,7 @@ from collections.abc import Generator, Mapping
 from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
@@ -32,7 +33,7 @@ DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
 PATIENCE_S = 300.0  # for all such waits of one write: a process that is starved may hold the database for minutes
 _LOG = logging.getLogger(__name__)
-REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
+REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006")  # of migrations/versions, in order
 RESTORE = (
     "`orthocapture store rebuild` restores a damaged database from its journal; or restore the folder from a copy"
 )
@@ -88,9 +89,16 @@ class Database:
     """Connections to one database. Writers use BEGIN IMMEDIATE, so no transaction must be upgraded and retried."""
 
     def __init__(
-        self, engine: Engine, path: Path, files: Files, patience_s: float = PATIENCE_S, journal: Journal | None = None
+        self,
+        engine: Engine,
+        path: Path,
+        files: Files,
+        patience_s: float = PATIENCE_S,
+        journal: Journal | None = None,
+        copy: TemporaryDirectory[str] | None = None,
     ) -> None:
         self._engine = engine
+        self._copy = copy  # the folder of a copy that goes with this object
         self._patience_s = patience_s
         self._path = path
         self._files = files
@@ -287,6 +295,8 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+        if self._copy is not None:
+            self._copy.cleanup()
 
 
 def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) -> Database:
@@ -332,9 +342,9 @@ def _require_what_the_journal_has(path: Path, journal: Journal) -> None:
 
 
 def open_read_only(data_dir: Path, files: Files) -> Database:
-    """Open an existing database read-only.
+    """Open an existing database read-only; one of an earlier version as an upgraded copy, which is gone when closed.
 
-    Raises StoreError if there is none, StoreVersionError if it is of another version.
+    Raises StoreError if there is none, StoreVersionError if it is of a newer version or not of this software.
     """
     path = database_path(data_dir)
     require_access(data_dir)
@@ -362,11 +372,31 @@ def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
         with database.reading() as connection:
             present = _revision(connection)
             _refuse_unknown(present, path)
-            _refuse_old(present, path)
+            _refuse_foreign(present, path)
+        return database if present == REVISIONS[-1] else _upgraded_copy(database, path, files)
     except BaseException:
         database.close()
         raise
-    return database
+
+
+def _upgraded_copy(database: Database, path: Path, files: Files) -> Database:
+    """Return a temporary copy of a database of an earlier version, upgraded; the database itself stays as it is."""
+    folder = TemporaryDirectory(prefix="orthocapture-")
+    copy = Path(folder.name) / DATABASE_NAME
+    try:
+        with _store_errors(path), database.reading() as connection, closing(sqlite3.connect(copy)) as target:
+            raw = connection.connection.driver_connection
+            assert isinstance(raw, sqlite3.Connection)  # the engine's own driver
+            raw.backup(target)
+        engine = create_engine(f"sqlite:///{copy}")
+        with _store_errors(path), engine.begin() as connection:
+            migrate(connection)
+        engine.dispose()
+    except BaseException:
+        folder.cleanup()
+        raise
+    database.close()
+    return Database(_engine(f"file:{quote(str(copy))}?uri=true&mode=ro", writable=False), path, files, copy=folder)
 
 
 def _engine(address: str, *, writable: bool) -> Engine:
@@ -413,14 +443,10 @@ def _refuse_unknown(present: str | None, path: Path) -> None:
         )
 
 
-def _refuse_old(present: str | None, path: Path) -> None:
-    if present != REVISIONS[-1]:
+def _refuse_foreign(present: str | None, path: Path) -> None:
+    if present is None:
         raise StoreVersionError(
-            "this database was written by an older version of orthocapture and has not been upgraded"
-            if present
-            else "this is not a database of orthocapture",
-            where=str(path),
-            remedy="Open it once with `orthocapture status`, or use the version that wrote it",
+            "this is not a database of orthocapture", where=str(path), remedy="Name a data folder with --data DIR"
         )
 
 

@@ -466,14 +466,6 @@ STATEMENTS: tuple[str, ...] = (
         "\n"
     ),
     "CREATE INDEX event_index_by_kind ON event_index (run_id, kind, seq)",
-    "CREATE VIRTUAL TABLE event_words USING fts5(words, content = '', columnsize = 0)",
-    (
-        "CREATE TRIGGER events_indexed AFTER INSERT ON events BEGIN INSERT INTO event_index (run_id, seq, "
-        "kind, step, device, actor) VALUES (NEW.run_id, NEW.seq, NEW.kind, json_extract(NEW.payload, "
-        "'$.step'), json_extract(NEW.payload, '$.device'), NEW.actor); INSERT INTO event_words (rowid, "
-        "words) VALUES (last_insert_rowid(), NEW.actor || ' ' || coalesce((SELECT group_concat(atom, ' ') "
-        "FROM json_tree(NEW.payload) WHERE type = 'text'), '')); END"
-    ),
     (
         "CREATE TRIGGER event_index_no_update BEFORE UPDATE ON event_index BEGIN SELECT RAISE(ABORT, "
         "'event_index is append-only: update refused'); END"
@@ -486,5 +478,39 @@ STATEMENTS: tuple[str, ...] = (
         "CREATE TRIGGER event_index_no_replace BEFORE INSERT ON event_index WHEN EXISTS (SELECT 1 FROM "
         "event_index WHERE position = NEW.position OR (run_id = NEW.run_id AND seq = NEW.seq)) BEGIN SELECT "
         "RAISE(ABORT, 'event_index is append-only: replace refused'); END"
+    ),
+    "CREATE VIRTUAL TABLE event_words USING fts5(words, content='', columnsize=0, tokenize='ascii')",
+    (
+        "CREATE TABLE event_facets (\n"
+        "\t"
+        "run_id TEXT NOT NULL, \n"
+        "\t"
+        "seq INTEGER NOT NULL, \n"
+        "\t"
+        "name TEXT NOT NULL, \n"
+        "\t"
+        "value TEXT NOT NULL, \n"
+        "\t"
+        "PRIMARY KEY (run_id, seq, name)\n"
+        ")\n"
+        " "
+        "WITHOUT ROWID,\n"
+        " "
+        "STRICT\n"
+        "\n"
+    ),
+    "CREATE INDEX event_facets_by_value ON event_facets (name, value, run_id)",
+    (
+        "CREATE TRIGGER event_facets_no_update BEFORE UPDATE ON event_facets BEGIN SELECT RAISE(ABORT, "
+        "'event_facets is append-only: update refused'); END"
+    ),
+    (
+        "CREATE TRIGGER event_facets_no_delete BEFORE DELETE ON event_facets BEGIN SELECT RAISE(ABORT, "
+        "'event_facets is append-only: delete refused'); END"
+    ),
+    (
+        "CREATE TRIGGER event_facets_no_replace BEFORE INSERT ON event_facets WHEN EXISTS (SELECT 1 FROM "
+        "event_facets WHERE run_id = NEW.run_id AND seq = NEW.seq AND name = NEW.name) BEGIN SELECT "
+        "RAISE(ABORT, 'event_facets is append-only: replace refused'); END"
     ),
 )

@@ -49,8 +49,8 @@ events = Table(
     sqlite_strict=True,
 )
 
-# The index by which auditors filter events, written with every event by the trigger events_indexed. There is also the
-# full-text index `event_words` (FTS5, contentless, rowid = position), which SQLAlchemy cannot describe.
+# The index by which auditors filter and search events (service.store.event_index). There is also the full-text index
+# `event_words` (FTS5, contentless, rowid = position), which SQLAlchemy cannot describe.
 event_index = Table(
     "event_index",
     metadata,
@@ -64,6 +64,20 @@ event_index = Table(
     UniqueConstraint("run_id", "seq", name="event_index_once"),
     Index("event_index_by_kind", "run_id", "kind", "seq"),
     sqlite_strict=True,
+)
+
+# Single values of the payloads by which events are found.
+event_facets = Table(
+    "event_facets",
+    metadata,
+    Column("run_id", Text, nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("name", Text, nullable=False),
+    Column("value", Text, nullable=False),
+    PrimaryKeyConstraint("run_id", "seq", "name"),
+    Index("event_facets_by_value", "name", "value", "run_id"),
+    sqlite_strict=True,
+    sqlite_with_rowid=False,
 )
 
 # The last event of each chain, written with every append, so that a truncated chain is found.

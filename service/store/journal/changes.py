@@ -14,7 +14,7 @@ from service.store.journal.lines import RowImage, Value
 
 # The record: whoever adds a table says whether the journal keeps it.
 KEPT = ("runs", "events", "artefacts", "jobs", "checkpoints", "timestamps", "accounts", "invitations")
-DERIVED = ("event_index", "heads")  # made again from the events
+DERIVED = ("event_index", "event_facets", "heads")  # made again from the events
 PRESENT_STATE = ("leases", "sessions", "control")  # of processes and screens of the moment
 _KEYS = {name: tuple(column.name for column in metadata.tables[name].primary_key.columns) for name in KEPT}
 _COLUMNS = {name: tuple(column.name for column in metadata.tables[name].columns) for name in KEPT}

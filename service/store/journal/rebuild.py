@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
+from sqlalchemy import create_engine
+
 from service.core.errors import StoreError
 from service.core.records.events import RecordRebuilt
 from service.store.access import KEYS
@@ -19,6 +21,7 @@ from service.store.artefacts import relative_path
 from service.store.backup.folder import folder_errors
 from service.store.database.engine import DATABASE_NAME, database_path, open_database, open_read_only
 from service.store.durable_effects import Clock, DurableFiles, Files, SystemClock, utc_text
+from service.store.event_index import index_all
 from service.store.journal import changes
 from service.store.journal.findings import Survey, committed_rows, journal_findings, survey
 from service.store.journal.journal import Journal
@@ -256,6 +259,12 @@ def _replay(work: Path, journal: Path, surveyed: Survey, until: int, lost: list[
             lost.append(f"row {row_number} of {table} belongs to a row of {parent} that is not there")
         (events,) = connection.execute("SELECT count(*) FROM events").fetchone()
         connection.execute("PRAGMA journal_mode = DELETE")  # a single file, which can be renamed
+    engine = create_engine(f"sqlite:///{database_path(work)}")
+    try:
+        with engine.begin() as connection:
+            index_all(connection)
+    finally:
+        engine.dispose()
     return int(events)
 
 

@@ -7,17 +7,17 @@ from collections.abc import Iterator, Sequence
 from sqlalchemy import Connection, text
 
 from service.store.database.engine import DATABASE_NAME, fresh_schema, read_schema
+from service.store.event_index import indexed_events
 from service.store.verification.chain_checks import Fault
 
-# Index rows that differ from their events, and events that are missing from the index.
+# Index rows that differ from their events, and events that are missing from the index. `_content_faults` compares
+# what is read out of payloads.
 # All columns are named explicitly: a flipped bit in the stored schema may turn a lower-case letter into a capital.
 _INDEX = """
 SELECT coalesce(e.run_id, i.run_id) AS run_id, coalesce(e.seq, i.seq) AS seq,
        e.seq IS NULL AS foreign_row, i.seq IS NULL AS missing_row
 FROM {left} LEFT JOIN {right} ON e.run_id = i.run_id AND e.seq = i.seq
-WHERE e.seq IS NULL OR i.seq IS NULL OR i.kind IS NOT e.kind OR i.actor IS NOT e.actor
-   OR (json_valid(e.payload) AND (i.step IS NOT json_extract(e.payload, '$.step')
-                                  OR i.device IS NOT json_extract(e.payload, '$.device')))
+WHERE e.seq IS NULL OR i.seq IS NULL OR i.kind <> e.kind OR i.actor <> e.actor
 """
 
 
@@ -35,6 +35,7 @@ SELECT j.run_id AS run_id, j.enqueued_seq AS enqueued_seq, j.job_id AS job_id, j
        row_number() OVER (ORDER BY i.position) AS place
 FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
+_DIFFERS = "the index of events does not say what the event says"
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # made by ANALYZE, which is harmless
 _NUMBERS = ("application_id",)  # in the database's header, which this software leaves 0
 
@@ -79,17 +80,35 @@ def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: b
             here = row.run_id in wanted or every_run
             if not here or (seen_before and not row.foreign_row):
                 continue
-            what = "the index of events does not say what the event says"
+            what = _DIFFERS
             if row.missing_row:
                 what = "the event is missing from the index by which auditors filter"
             elif row.foreign_row:
                 what = "the index of events has a row of an event that is not there"
             yield Fault(str(row.run_id), int(row.seq), "", what)
+    yield from _content_faults(connection, wanted, every_run=every_run)
     gap = 0
     for row in connection.execute(text(_PLACES)):
         moved, gap = row.gap != gap or row.seq != (row.before or 0) + 1, row.gap
         if moved and (row.run_id in wanted or every_run):
             what = f"its place in the index of events ({row.place}) is not that in which it was written"
+            yield Fault(str(row.run_id), int(row.seq), "", what)
+
+
+def _content_faults(connection: Connection, wanted: frozenset[str], *, every_run: bool) -> Iterator[Fault]:
+    """Yield a fault for each event whose step, device or facets in the index are not those of its payload."""
+    for event in indexed_events(connection):
+        if (event.run_id in wanted or every_run) and not event.agrees:
+            yield Fault(event.run_id, event.seq, "", _DIFFERS)
+    foreign = connection.execute(
+        text(
+            "SELECT DISTINCT f.run_id AS run_id, f.seq AS seq FROM event_facets AS f LEFT JOIN events AS e "
+            "ON e.run_id = f.run_id AND e.seq = f.seq WHERE e.seq IS NULL"
+        )
+    )
+    for row in foreign:
+        if row.run_id in wanted or every_run:
+            what = "the index of events has facets of an event that is not there"
             yield Fault(str(row.run_id), int(row.seq), "", what)
 
 

@@ -9,17 +9,10 @@ from contextlib import closing
 from sqlalchemy import Connection, text
 
 from service.store.database.engine import DATABASE_NAME
+from service.store.event_index import WORDS_TABLE, indexed_events, words_of
 from service.store.verification.chain_checks import Fault
 
-_MADE = "USING fts5(words, content = '', columnsize = 0)"
 _PARTS = {"data": "id, block", "idx": "segid, term, pgno", "config": "k, v"}  # shadow tables of the index
-# The same words in the same order as the trigger events_indexed wrote them.
-_WORDS = """
-SELECT i.position, e.actor || ' ' ||
-       coalesce((SELECT group_concat(atom, ' ') FROM json_tree(e.payload) WHERE type = 'text'), '')
-FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq
-WHERE json_valid(e.payload) ORDER BY i.position
-"""
 _OTHER = """
 SELECT DISTINCT doc FROM (SELECT * FROM (SELECT * FROM {0}_places EXCEPT SELECT * FROM {1}_places)
 UNION ALL SELECT * FROM (SELECT * FROM {1}_places EXCEPT SELECT * FROM {0}_places)) ORDER BY doc
@@ -55,14 +48,14 @@ def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Faul
 def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list[int], str]:
     """Return positions of events whose words differ, and what is wrong with the index itself ("" if nothing)."""
     for name in _BOTH:
-        private.execute(f"CREATE VIRTUAL TABLE {name} {_MADE}")
+        private.execute(WORDS_TABLE.replace("event_words", name))
     for part, columns in _PARTS.items():
         private.execute(f"DELETE FROM present_{part}")
         rows = connection.execute(text(f"SELECT {columns} FROM event_words_{part}"))
         marks = ", ".join("?" for _ in columns.split(","))
         private.executemany(f"INSERT INTO present_{part} ({columns}) VALUES ({marks})", (tuple(row) for row in rows))
-    words = connection.execute(text(_WORDS))
-    private.executemany("INSERT INTO again (rowid, words) VALUES (?, ?)", (tuple(row) for row in words))
+    words = ((event.position, words_of(event.actor, event.payload)) for event in indexed_events(connection))
+    private.executemany("INSERT INTO again (rowid, words) VALUES (?, ?)", words)
     private.commit()
     versions = [private.execute(f"SELECT k, v FROM {name}_config ORDER BY k").fetchall() for name in _BOTH]
     if versions[0] != versions[1]:

@@ -26,6 +26,7 @@ from service.core.errors import OrthocaptureError
 from service.core.recorded_devices import CameraBodies, RecordedIdentity
 from service.people.approvals import Approval, approvals, difference
 from service.run_record import results_to_come
+from service.store.event_index import facet_value
 from service.store.records import SITE
 from service.store.store import Store
 from service.web.audit.frame import AuditState, CurrentAudit, RunQuery, audit_frame, close_audit, link
@@ -57,10 +58,11 @@ class ProtocolIdentity:
 
 
 _CONTENTS = text(
-    "SELECT e.run_id, json_extract(e.payload, '$.protocol_sha256') AS sha256 FROM events AS e "
-    "WHERE e.seq = 1 AND e.run_id <> :site AND json_valid(e.payload) "
-    "AND json_extract(e.payload, '$.protocol_id') = :protocol "
-    "AND json_extract(e.payload, '$.protocol_version') = :version ORDER BY e.run_id"
+    "SELECT p.run_id, s.value AS sha256 FROM event_facets AS p "
+    "JOIN event_facets AS v ON v.run_id = p.run_id AND v.seq = 1 AND v.name = 'protocol_version' "
+    "JOIN event_facets AS s ON s.run_id = p.run_id AND s.seq = 1 AND s.name = 'protocol_sha256' "
+    "WHERE p.seq = 1 AND p.run_id <> :site AND p.name = 'protocol_id' AND p.value = :protocol "
+    "AND v.value = :version ORDER BY p.run_id"
 )
 
 
@@ -68,7 +70,9 @@ def protocol_identity(store: Store, run_id: str, protocol: str, version: str) ->
     """Look up the contents that runs used under this protocol's name, and who approved each of them."""
     known = approvals(store, protocol, version)
     with store.database.reading() as connection:
-        rows = connection.execute(_CONTENTS, {"site": SITE, "protocol": protocol, "version": version})
+        rows = connection.execute(
+            _CONTENTS, {"site": SITE, "protocol": facet_value(protocol), "version": facet_value(version)}
+        )
         by_run = {str(row.run_id): str(row.sha256 or "") for row in rows}
     mine = by_run.get(run_id, "")
     approved = {one.payload.sha256: one for one in known}

@@ -16,11 +16,14 @@ from service.store.journal.journal import Journal
 from service.store.journal.lines import NAME
 from tests.support.record.store import rows, tamper
 
-# Rebuilds the search index from the current events; tamper() has dropped the triggers before this runs.
-WORDS_AGAIN = (
+# Writes facets and words of the present events again, with the functions of `know_index`; tamper() has dropped the
+# triggers before this runs.
+INDEX_AGAIN = (
+    "DELETE FROM event_facets",
+    "INSERT INTO event_facets SELECT e.run_id, e.seq, f.key, f.value "
+    "FROM events AS e JOIN json_each(facets_of(e.payload)) AS f",
     "INSERT INTO event_words (event_words) VALUES ('delete-all')",
-    "INSERT INTO event_words (rowid, words) SELECT i.position, e.actor || ' ' || "
-    "coalesce((SELECT group_concat(atom, ' ') FROM json_tree(e.payload) WHERE type = 'text'), '') "
+    "INSERT INTO event_words (rowid, words) SELECT i.position, words_of(e.actor, e.payload) "
     "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq ORDER BY i.position",
 )
 _EVENT: tuple[str, ...] = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256", "payload", "sha256")
@@ -97,5 +100,5 @@ def cut(run: str, seq: int) -> list[str]:
         f"DELETE FROM event_index WHERE {of}",
         f"DELETE FROM events WHERE {of}",
         f"UPDATE heads SET seq = {seq - 1}, sha256 = {last} WHERE run_id = '{run}'",
-        *WORDS_AGAIN,
+        *INDEX_AGAIN,
     ]

@@ -1,0 +1,204 @@
+"""The index by which auditors filter and search events, written with each event and derived from it alone.
+
+It has a narrow row for each event, the facets that pages ask for in SQL, and a full-text index of plain words. All of
+it is computed here in Python, so that every database finds the same events, and a verification computes it again.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic_core import from_json
+from sqlalchemy import Connection, and_, bindparam, insert, literal_column, select, text
+
+from service.store.database.tables import event_facets, event_index, events
+
+# Facet → where its value stands in the payload. A facet of an event is a text, a number or a truth value.
+FACETS: Mapping[str, tuple[str, ...]] = {
+    "account": ("account",),
+    "action": ("action",),
+    "address": ("address",),
+    "body_serial": ("camera", "body_serial"),
+    "boot": ("boot",),
+    "clock_offset_s": ("clock_offset_s",),
+    "field": ("field",),
+    "job": ("job",),
+    "job_kind": ("job_kind",),
+    "outcome": ("outcome",),
+    "protocol_id": ("protocol_id",),
+    "protocol_sha256": ("protocol_sha256",),
+    "protocol_version": ("protocol_version",),
+}
+WORDS_TABLE = "CREATE VIRTUAL TABLE event_words USING fts5(words, content='', columnsize=0, tokenize='ascii')"
+_LONGEST = 200  # characters of a word or a facet; what is longer is cut
+_WORD = re.compile(r"[^\W_]+")
+_AT_ONCE = 500  # events
+_EXACT = 2**53  # a larger integer in canonical JSON was a float
+
+# Statements of every append are put together once, which takes SQLAlchemy longer than SQLite takes to execute them.
+_INSERT_ROW = insert(event_index)
+_INSERT_FACETS = insert(event_facets)
+_INSERT_WORDS = text("INSERT INTO event_words (rowid, words) VALUES (:position, :words)")
+OF_FACET = and_(event_facets.c.run_id == event_index.c.run_id, event_facets.c.seq == event_index.c.seq)
+_INDEXED = (
+    select(event_index.c.position, event_index.c.step, event_index.c.device, events)
+    .join(events, and_(events.c.run_id == event_index.c.run_id, events.c.seq == event_index.c.seq))
+    .where(event_index.c.position > bindparam("after"))
+    .order_by(event_index.c.position)
+    .limit(_AT_ONCE)
+)
+_FACETS = (
+    select(event_index.c.position, event_facets.c.name, event_facets.c.value)
+    .join(event_facets, OF_FACET)
+    .where(event_index.c.position > bindparam("after"), event_index.c.position <= bindparam("last"))
+    .order_by(event_index.c.position, event_facets.c.name)
+)
+_ROWID = literal_column("events.rowid")  # no event is ever removed, so it counts them
+_INSERTED = (
+    select(_ROWID, events.c.run_id, events.c.seq, events.c.kind, events.c.actor, events.c.payload)
+    .where(bindparam("after") < _ROWID)
+    .order_by(_ROWID)
+    .limit(_AT_ONCE)
+)
+
+
+def index_event(connection: Connection, run_id: str, seq: int, kind: str, actor: str, payload: Any) -> None:
+    """Write the index of an event that was just inserted, in the same transaction; `payload` is its plain data."""
+    row = {"run_id": run_id, "seq": seq, "kind": kind, "actor": actor, **columns_of(payload)}
+    key = connection.execute(_INSERT_ROW, row).inserted_primary_key
+    assert key is not None  # one row was inserted
+    _write_derived(connection, key[0], run_id, seq, actor, payload)
+
+
+def index_all(connection: Connection) -> None:
+    """Write the index of every event of a database that has none, in the order in which the events were inserted."""
+    after = 0
+    while rows := connection.execute(_INSERTED, {"after": after}).all():
+        for _, run_id, seq, kind, actor, payload in rows:
+            index_event(connection, run_id, seq, kind, actor, _plain(payload))
+        after = rows[-1][0]
+
+
+def index_again(connection: Connection) -> None:
+    """Write facets and words of all events that have a row in the index, for tables that were made anew."""
+    for event in indexed_events(connection):
+        _write_derived(connection, event.position, event.run_id, event.seq, event.actor, event.payload)
+
+
+@dataclass(frozen=True, slots=True)
+class IndexedEvent:
+    """An event with what the index says of it."""
+
+    position: int
+    run_id: str
+    seq: int
+    actor: str
+    payload: Any  # plain data; None if it is not JSON, which the verification of the chain reports
+    step: str | None  # this and the next as the index has them
+    device: str | None
+    facets: Sequence[tuple[str, str]]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether step, device and facets are those of the payload."""
+        named = {"step": self.step, "device": self.device}
+        return self.payload is None or (named == columns_of(self.payload) and self.facets == facets_of(self.payload))
+
+
+def indexed_events(connection: Connection) -> Iterator[IndexedEvent]:
+    """Yield all events that have a row in the index, in the order of writing."""
+    after = -1
+    while rows := connection.execute(_INDEXED, {"after": after}).all():
+        facets: dict[int, list[tuple[str, str]]] = {}
+        for position, name, value in connection.execute(_FACETS, {"after": after, "last": rows[-1].position}):
+            facets.setdefault(position, []).append((name, value))
+        for row in rows:
+            yield IndexedEvent(
+                row.position,
+                row.run_id,
+                row.seq,
+                row.actor,
+                _plain(row.payload),
+                row.step,
+                row.device,
+                facets.get(row.position, []),
+            )
+        after = rows[-1].position
+
+
+def _plain(payload: str) -> Any:
+    """Return the plain data of a payload; None if it is not JSON."""
+    try:
+        return from_json(payload)
+    except ValueError:
+        return None
+
+
+def _write_derived(connection: Connection, position: int, run_id: str, seq: int, actor: str, payload: Any) -> None:
+    facets = [{"run_id": run_id, "seq": seq, "name": name, "value": value} for name, value in facets_of(payload)]
+    if facets:
+        connection.execute(_INSERT_FACETS, facets)
+    connection.execute(_INSERT_WORDS, {"position": position, "words": words_of(actor, payload)})
+
+
+def columns_of(payload: Any) -> dict[str, str | None]:
+    """Return step and device of a payload; None for what it does not name."""
+    named = payload if isinstance(payload, Mapping) else {}
+    found = {name: named.get(name) for name in ("step", "device")}
+    return {name: value if isinstance(value, str) else None for name, value in found.items()}
+
+
+def facets_of(payload: Any) -> list[tuple[str, str]]:
+    """Return name and value of the facets of a payload, sorted by name."""
+    found: list[tuple[str, str]] = []
+    for name, path in FACETS.items():
+        value = payload
+        for part in path:
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if isinstance(value, str | int | float):
+            found.append((name, facet_value(value)))
+    return found
+
+
+def facet_value(value: str | float) -> str:
+    """Return the text by which a value of a facet is found; a number as in JSON, a truth value as true or false."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    exact = isinstance(value, str) or abs(value) <= _EXACT
+    return str(value if exact else float(value))[:_LONGEST]
+
+
+def words_of(actor: str, payload: Any) -> str:
+    """Return the words by which an event is found, separated by spaces: of its actor and of the payload's texts.
+
+    Numbers and names of fields are not searched for.
+    """
+    return " ".join(word for said in (actor, *_texts(payload)) for word in cut_words(said))
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _texts(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _texts(item)
+
+
+def cut_words(said: str) -> list[str]:
+    """Return the words of a text: runs of letters and digits in lower case, without accents."""
+    if not said.isascii():
+        decomposed = unicodedata.normalize("NFKD", said).casefold()
+        said = "".join(letter for letter in decomposed if not unicodedata.combining(letter))
+    return [word[:_LONGEST] for word in _WORD.findall(said.lower())]
+
+
+def phrase(words: Sequence[str], *, beginning: bool = False) -> str:
+    """Return an expression that finds these words in a row; with `beginning`, the last one also as a beginning."""
+    return f'"{" ".join(words)}"{"*" if beginning else ""}'
