@@ -10,10 +10,10 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic_core import from_json
-from sqlalchemy import Connection, and_, bindparam, insert, literal_column, select, text
+from sqlalchemy import Connection, and_, bindparam, func, insert, literal_column, select, text
 
 from service.store.database.tables import event_facets, event_index, events
 
@@ -40,12 +40,21 @@ _AT_ONCE = 500  # events
 _EXACT = 2**53  # a larger integer in canonical JSON was a float
 
 # Statements of every append are put together once, which takes SQLAlchemy longer than SQLite takes to execute them.
-_INSERT_ROW = insert(event_index)
+_NEXT_POSITION = select(func.coalesce(func.max(event_index.c.position), 0) + 1)
+_INSERT_ROWS = insert(event_index)
 _INSERT_FACETS = insert(event_facets)
 _INSERT_WORDS = text("INSERT INTO event_words (rowid, words) VALUES (:position, :words)")
 OF_FACET = and_(event_facets.c.run_id == event_index.c.run_id, event_facets.c.seq == event_index.c.seq)
 _INDEXED = (
-    select(event_index.c.position, event_index.c.step, event_index.c.device, events)
+    select(
+        event_index.c.position,
+        event_index.c.run_id,
+        event_index.c.seq,
+        event_index.c.step,
+        event_index.c.device,
+        events.c.actor,
+        events.c.payload,
+    )
     .join(events, and_(events.c.run_id == event_index.c.run_id, events.c.seq == event_index.c.seq))
     .where(event_index.c.position > bindparam("after"))
     .order_by(event_index.c.position)
@@ -66,27 +75,56 @@ _INSERTED = (
 )
 
 
-def index_event(connection: Connection, run_id: str, seq: int, kind: str, actor: str, payload: Any) -> None:
-    """Write the index of an event that was just inserted, in the same transaction; `payload` is its plain data."""
-    row = {"run_id": run_id, "seq": seq, "kind": kind, "actor": actor, **columns_of(payload)}
-    key = connection.execute(_INSERT_ROW, row).inserted_primary_key
-    assert key is not None  # one row was inserted
-    _write_derived(connection, key[0], run_id, seq, actor, payload)
+class EventToIndex(NamedTuple):
+    """An event that was just inserted."""
+
+    run_id: str
+    seq: int
+    kind: str
+    actor: str
+    payload: Any  # plain data; None if it is not JSON
+
+
+def index_events(connection: Connection, new: Sequence[EventToIndex]) -> None:
+    """Write the index of events that were just inserted, in the same transaction, after all that are in it."""
+    first = connection.execute(_NEXT_POSITION).scalar_one()
+    rows: list[dict[str, Any]] = []
+    for position, event in enumerate(new, first):
+        row = {"position": position, "run_id": event.run_id, "seq": event.seq, "kind": event.kind}
+        rows.append(row | {"actor": event.actor, **columns_of(event.payload)})
+    connection.execute(_INSERT_ROWS, rows)
+    _write_derived(connection, [(position, event) for position, event in enumerate(new, first)])
 
 
 def index_all(connection: Connection) -> None:
     """Write the index of every event of a database that has none, in the order in which the events were inserted."""
     after = 0
     while rows := connection.execute(_INSERTED, {"after": after}).all():
-        for _, run_id, seq, kind, actor, payload in rows:
-            index_event(connection, run_id, seq, kind, actor, _plain(payload))
+        events_of_chunk = [
+            EventToIndex(run, seq, kind, actor, _plain(text)) for _, run, seq, kind, actor, text in rows
+        ]
+        index_events(connection, events_of_chunk)
         after = rows[-1][0]
 
 
 def index_again(connection: Connection) -> None:
     """Write facets and words of all events that have a row in the index, for tables that were made anew."""
     for event in indexed_events(connection):
-        _write_derived(connection, event.position, event.run_id, event.seq, event.actor, event.payload)
+        _write_derived(
+            connection, [(event.position, EventToIndex(event.run_id, event.seq, "", event.actor, event.payload))]
+        )
+
+
+def _write_derived(connection: Connection, placed: Sequence[tuple[int, EventToIndex]]) -> None:
+    facets = [
+        {"run_id": event.run_id, "seq": event.seq, "name": name, "value": value}
+        for _, event in placed
+        for name, value in facets_of(event.payload)
+    ]
+    if facets:
+        connection.execute(_INSERT_FACETS, facets)
+    words = [{"position": place, "words": words_of(event.actor, event.payload)} for place, event in placed]
+    connection.execute(_INSERT_WORDS, words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +134,11 @@ class IndexedEvent:
     position: int
     run_id: str
     seq: int
-    actor: str
-    payload: Any  # plain data; None if it is not JSON, which the verification of the chain reports
-    step: str | None  # this and the next as the index has them
+    step: str | None  # this and the next two as the index has them
     device: str | None
     facets: Sequence[tuple[str, str]]
+    actor: str
+    payload: Any  # plain data; None if it is not JSON, which the verification of the chain reports
 
     @property
     def agrees(self) -> bool:
@@ -116,17 +154,9 @@ def indexed_events(connection: Connection) -> Iterator[IndexedEvent]:
         facets: dict[int, list[tuple[str, str]]] = {}
         for position, name, value in connection.execute(_FACETS, {"after": after, "last": rows[-1].position}):
             facets.setdefault(position, []).append((name, value))
-        for row in rows:
-            yield IndexedEvent(
-                row.position,
-                row.run_id,
-                row.seq,
-                row.actor,
-                _plain(row.payload),
-                row.step,
-                row.device,
-                facets.get(row.position, []),
-            )
+        for position, run_id, seq, step, device, actor, payload in rows:
+            said = facets.get(position, [])
+            yield IndexedEvent(position, run_id, seq, step, device, said, actor, _plain(payload))
         after = rows[-1].position
 
 
@@ -136,13 +166,6 @@ def _plain(payload: str) -> Any:
         return from_json(payload)
     except ValueError:
         return None
-
-
-def _write_derived(connection: Connection, position: int, run_id: str, seq: int, actor: str, payload: Any) -> None:
-    facets = [{"run_id": run_id, "seq": seq, "name": name, "value": value} for name, value in facets_of(payload)]
-    if facets:
-        connection.execute(_INSERT_FACETS, facets)
-    connection.execute(_INSERT_WORDS, {"position": position, "words": words_of(actor, payload)})
 
 
 def columns_of(payload: Any) -> dict[str, str | None]:

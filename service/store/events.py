@@ -18,7 +18,7 @@ from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
 from service.core.shown_text import storable, storable_data
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text
-from service.store.event_index import index_event
+from service.store.event_index import EventToIndex, index_events
 
 ROOT = "0" * 64  # previous_sha256 of the first event
 _SAFE = 2**53 - 1
@@ -189,6 +189,8 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
     """
     seq, previous = read_head(connection, run_id)
     appended: list[Event] = []
+    rows: list[dict[str, Any]] = []
+    to_index: list[EventToIndex] = []
     for payload in payloads:
         seq += 1
         text = payload_text(payload)
@@ -202,10 +204,12 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
             "previous_sha256": previous,
         }
         previous = event_sha256_of_text(fields, text)
-        connection.execute(_INSERT, fields | {"kind": payload.kind, "payload": text, "sha256": previous})
-        index_event(connection, run_id, seq, payload.kind, fields["actor"], fields["payload"])
+        rows.append(fields | {"kind": payload.kind, "payload": text, "sha256": previous})
+        to_index.append(EventToIndex(run_id, seq, payload.kind, fields["actor"], fields["payload"]))
         appended.append(Event.model_validate(fields | {"sha256": previous}))
     if appended:
+        connection.execute(_INSERT, rows)
+        index_events(connection, to_index)
         connection.execute(_MOVE_HEAD, {"run": run_id, "seq": seq, "sha256": previous})
     return appended
 

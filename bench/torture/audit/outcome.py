@@ -24,17 +24,17 @@ from service.store.journal import lines as journal_lines
 from service.store.signatures import log as signature_log
 from service.store.signatures.log import LogLine
 from service.store.verification import chain_checks as audit_checks
-from service.store.verification import file_checks
-from service.store.verification import search_checks as audit_words
+from service.store.verification import file_checks, search_checks
 from service.store.verification import signature_checks as audit_signatures
 from service.store.verification import verify as audit
 from service.store.verification.chain_checks import Fault
 
-_WORDS_COME_FROM = (
+_CONTENTS_COME_FROM = (
     "SELECT * FROM event_words_data",
     "SELECT * FROM event_words_idx",
     "SELECT * FROM event_words_config",
-    "SELECT position, run_id, seq FROM event_index ORDER BY position",
+    "SELECT * FROM event_facets",
+    "SELECT position, run_id, seq, step, device FROM event_index ORDER BY position",
     "SELECT run_id, seq, actor, payload FROM events",
 )
 _NUMBERS = ("user_version", "application_id", "encoding")
@@ -103,7 +103,9 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
             stack.enter_context(patch.object(file_checks, "_file_state", functools.cache(file_state)))
             unlisted = functools.cache(file_checks.unlisted_files)
             stack.enter_context(patch.object(audit, "unlisted_files", unlisted))
-        stack.enter_context(patch.object(audit, "word_faults", _remembered_words(database_stays=database_stays)))
+        stack.enter_context(
+            patch.object(audit, "content_faults", _remembered_contents(database_stays=database_stays))
+        )
         gc.disable()
         stack.callback(gc.enable)
         for target, name, new in (
@@ -119,16 +121,16 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
         yield
 
 
-def _remembered_words(*, database_stays: bool) -> Callable[[Connection, Sequence[str]], list[Fault]]:
+def _remembered_contents(*, database_stays: bool) -> Callable[..., list[Fault]]:
     kept: dict[object, list[Fault]] = {}
 
-    def faults(connection: Connection, run_ids: Sequence[str]) -> list[Fault]:
-        key: object = tuple(run_ids)
+    def faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> list[Fault]:
+        key: object = tuple(run_ids), every_run
         if not database_stays:
-            read = [tuple(map(tuple, connection.exec_driver_sql(asked))) for asked in _WORDS_COME_FROM]
+            read = [tuple(map(tuple, connection.exec_driver_sql(asked))) for asked in _CONTENTS_COME_FROM]
             key = key, tuple(read)
         if key not in kept:
-            kept[key] = list(audit_words.word_faults(connection, run_ids))
+            kept[key] = list(search_checks.content_faults(connection, run_ids, every_run=every_run))
         return kept[key]
 
     return faults

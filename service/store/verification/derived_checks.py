@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from sqlalchemy import Connection, text
 
 from service.store.database.engine import DATABASE_NAME, fresh_schema, read_schema
-from service.store.event_index import indexed_events
 from service.store.verification.chain_checks import Fault
+from service.store.verification.search_checks import INDEX_DIFFERS
 
-# Index rows that differ from their events, and events that are missing from the index. `_content_faults` compares
-# what is read out of payloads.
+# Index rows that differ from their events, and events that are missing from the index. What is read out of payloads
+# is compared in search_checks, which reads them all.
 # All columns are named explicitly: a flipped bit in the stored schema may turn a lower-case letter into a capital.
 _INDEX = """
 SELECT coalesce(e.run_id, i.run_id) AS run_id, coalesce(e.seq, i.seq) AS seq,
@@ -21,6 +21,10 @@ WHERE e.seq IS NULL OR i.seq IS NULL OR i.kind <> e.kind OR i.actor <> e.actor
 """
 
 
+_FOREIGN_FACETS = """
+SELECT DISTINCT f.run_id AS run_id, f.seq AS seq
+FROM event_facets AS f LEFT JOIN events AS e ON e.run_id = f.run_id AND e.seq = f.seq WHERE e.seq IS NULL
+"""
 # Positions count up in the order of writing over all runs.
 _PLACES = """
 SELECT run_id AS run_id, seq AS seq, place AS place, before AS before,
@@ -35,7 +39,6 @@ SELECT j.run_id AS run_id, j.enqueued_seq AS enqueued_seq, j.job_id AS job_id, j
        row_number() OVER (ORDER BY i.position) AS place
 FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
-_DIFFERS = "the index of events does not say what the event says"
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # made by ANALYZE, which is harmless
 _NUMBERS = ("application_id",)  # in the database's header, which this software leaves 0
 
@@ -80,35 +83,21 @@ def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: b
             here = row.run_id in wanted or every_run
             if not here or (seen_before and not row.foreign_row):
                 continue
-            what = _DIFFERS
+            what = INDEX_DIFFERS
             if row.missing_row:
                 what = "the event is missing from the index by which auditors filter"
             elif row.foreign_row:
                 what = "the index of events has a row of an event that is not there"
             yield Fault(str(row.run_id), int(row.seq), "", what)
-    yield from _content_faults(connection, wanted, every_run=every_run)
+    for row in connection.execute(text(_FOREIGN_FACETS)):
+        if row.run_id in wanted or every_run:
+            what = "the index of events has facets of an event that is not there"
+            yield Fault(str(row.run_id), int(row.seq), "", what)
     gap = 0
     for row in connection.execute(text(_PLACES)):
         moved, gap = row.gap != gap or row.seq != (row.before or 0) + 1, row.gap
         if moved and (row.run_id in wanted or every_run):
             what = f"its place in the index of events ({row.place}) is not that in which it was written"
-            yield Fault(str(row.run_id), int(row.seq), "", what)
-
-
-def _content_faults(connection: Connection, wanted: frozenset[str], *, every_run: bool) -> Iterator[Fault]:
-    """Yield a fault for each event whose step, device or facets in the index are not those of its payload."""
-    for event in indexed_events(connection):
-        if (event.run_id in wanted or every_run) and not event.agrees:
-            yield Fault(event.run_id, event.seq, "", _DIFFERS)
-    foreign = connection.execute(
-        text(
-            "SELECT DISTINCT f.run_id AS run_id, f.seq AS seq FROM event_facets AS f LEFT JOIN events AS e "
-            "ON e.run_id = f.run_id AND e.seq = f.seq WHERE e.seq IS NULL"
-        )
-    )
-    for row in foreign:
-        if row.run_id in wanted or every_run:
-            what = "the index of events has facets of an event that is not there"
             yield Fault(str(row.run_id), int(row.seq), "", what)
 
 

@@ -1,4 +1,4 @@
-"""Check the full-text index: index the words of the events again and compare."""
+"""Check what the index says of the contents of events: derive facets and words again and compare."""
 
 from __future__ import annotations
 
@@ -18,20 +18,24 @@ SELECT DISTINCT doc FROM (SELECT * FROM (SELECT * FROM {0}_places EXCEPT SELECT 
 UNION ALL SELECT * FROM (SELECT * FROM {1}_places EXCEPT SELECT * FROM {0}_places)) ORDER BY doc
 """
 _BOTH = ("present", "again")
+INDEX_DIFFERS = "the index of events does not say what the event says"
 _DAMAGED = "the index by which auditors search is damaged"
 
 
-def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Yield a fault for each event whose words a search would not find, or would find in another event.
+def content_faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
+    """Yield a fault for each event with other facets, and each that a search would not find or would find wrongly.
 
     All work is done on copies in a private database; the evidence is not opened for writing.
     """
+    differing: list[tuple[str, int]] = []
     try:
         with closing(sqlite3.connect("")) as private:  # "": a temporary database, on disk once it is large
+            _index_words(connection, private, differing)
             wrong, damage = _compared(connection, private)
     except sqlite3.Error as error:
         wrong, damage = [], f"{_DAMAGED}: {error}"
     wanted, placed = frozenset(run_ids), False
+    yield from (Fault(run, seq, "", INDEX_DIFFERS) for run, seq in differing if run in wanted or every_run)
     for position in wrong:
         found = text("SELECT run_id, seq FROM event_index WHERE position = :position")
         row = connection.execute(found, {"position": position}).one_or_none()
@@ -45,17 +49,27 @@ def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Faul
         yield Fault(None, None, DATABASE_NAME, damage)
 
 
+def _index_words(connection: Connection, private: sqlite3.Connection, differing: list[tuple[str, int]]) -> None:
+    """Index the words of all events in the table `again`, and list those of which the index has other facets."""
+    private.execute(WORDS_TABLE.replace("event_words", "again"))
+
+    def words() -> Iterator[tuple[int, str]]:
+        for event in indexed_events(connection):
+            if not event.agrees:
+                differing.append((event.run_id, event.seq))
+            yield event.position, words_of(event.actor, event.payload)
+
+    private.executemany("INSERT INTO again (rowid, words) VALUES (?, ?)", words())
+
+
 def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list[int], str]:
     """Return positions of events whose words differ, and what is wrong with the index itself ("" if nothing)."""
-    for name in _BOTH:
-        private.execute(WORDS_TABLE.replace("event_words", name))
+    private.execute(WORDS_TABLE.replace("event_words", "present"))
     for part, columns in _PARTS.items():
         private.execute(f"DELETE FROM present_{part}")
         rows = connection.execute(text(f"SELECT {columns} FROM event_words_{part}"))
         marks = ", ".join("?" for _ in columns.split(","))
         private.executemany(f"INSERT INTO present_{part} ({columns}) VALUES ({marks})", (tuple(row) for row in rows))
-    words = ((event.position, words_of(event.actor, event.payload)) for event in indexed_events(connection))
-    private.executemany("INSERT INTO again (rowid, words) VALUES (?, ?)", words)
     private.commit()
     versions = [private.execute(f"SELECT k, v FROM {name}_config ORDER BY k").fetchall() for name in _BOTH]
     if versions[0] != versions[1]:

@@ -28,7 +28,7 @@ from service.store.verification.chain_checks import ChainFacts, Fault, FileState
 from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
 from service.store.verification.file_checks import Progress, hash_files, unlisted_files
 from service.store.verification.people_checks import people_faults
-from service.store.verification.search_checks import word_faults
+from service.store.verification.search_checks import content_faults
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +262,7 @@ def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: b
     yield from derived.reference_faults(connection)
     yield from derived.index_faults(connection, runs, every_run=every_run)
     yield from derived.queue_faults(connection, runs)
-    yield from word_faults(connection, runs)
+    yield from content_faults(connection, runs, every_run=every_run)
 
 
 def _counted(
