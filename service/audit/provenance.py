@@ -16,7 +16,7 @@ from service.audit.record.search import artefacts_of_events, one_artefact
 from service.computations import job_kinds
 from service.core.jobs import Each, Reference, references_in
 from service.core.records.events import FilesKept, JobEnqueued
-from service.store.event_index import cut_words, phrase
+from service.store.event_index import cut_words, matching
 from service.store.events import parse_canonical
 from service.store.records import Artefact
 from service.store.store import Store
@@ -238,12 +238,13 @@ def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
 
 def _naming(connection: Connection, run_id: str, word: str, limit: int = LISTED) -> list[int]:
     """Return the events whose payload has this word."""
+    positions, match = matching(connection, [cut_words(plain(word))])
     found = connection.execute(
         text(
-            "SELECT i.seq FROM event_words AS w JOIN event_index AS i ON i.position = w.rowid "
-            "WHERE w.event_words MATCH :match AND i.run_id = :run ORDER BY w.rowid LIMIT :limit"
+            f"SELECT i.seq FROM ({positions}) AS w JOIN event_index AS i ON i.position = w.position "
+            "WHERE i.run_id = :run ORDER BY i.position LIMIT :limit"
         ),
-        {"run": plain(run_id), "match": phrase(cut_words(plain(word))), "limit": limit},
+        {"run": plain(run_id), "match": match, "limit": limit},
     ).scalars()
     return list(found)
 

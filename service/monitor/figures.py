@@ -130,13 +130,15 @@ def _viewpoint_s(connection: Connection, run_id: str) -> float | None:
 
 
 def _job_seconds(connection: Connection) -> dict[str, tuple[int, float]]:
-    taken_s = (func.julianday(jobs.c.ended_utc) - func.julianday(jobs.c.started_utc)) * 86400
-    found = (
-        select(jobs.c.kind, func.count().label("n"), func.sum(taken_s).label("seconds"))
-        .where(jobs.c.state == "finished", jobs.c.started_utc.is_not(None))
-        .group_by(jobs.c.kind)
+    found: dict[str, tuple[int, float]] = {}
+    ended = select(jobs.c.kind, jobs.c.started_utc, jobs.c.ended_utc).where(
+        jobs.c.state == "finished", jobs.c.started_utc.is_not(None)
     )
-    return {row.kind: (row.n, max(0.0, float(row.seconds))) for row in connection.execute(found)}
+    for kind, started, end in connection.execute(ended):
+        taken_s = (datetime.fromisoformat(end) - datetime.fromisoformat(started)).total_seconds()
+        number, total_s = found.get(kind, (0, 0.0))
+        found[kind] = (number + 1, max(0.0, total_s + taken_s))
+    return found
 
 
 def _queue(connection: Connection) -> dict[str, int]:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from pydantic_core import from_json
 from sqlalchemy import Connection, and_, bindparam, func, insert, literal_column, select, text
 
+from service.store.database.database import is_postgres
 from service.store.database.tables import event_facets, event_index, events
 
 # Facet → where its value stands in the payload. A facet of an event is a text, a number or a truth value.
@@ -37,12 +38,14 @@ WORDS_TABLE = "CREATE VIRTUAL TABLE event_words USING fts5(words, content='', co
 _LONGEST = 200  # characters of a word or a facet; what is longer is cut
 _WORD = re.compile(r"[^\W_]+")
 _AT_ONCE = 500  # events
+_LAST_PLACE = 16383  # of a word in a tsvector
 _EXACT = 2**53  # a larger integer in canonical JSON was a float
 
 # Statements of every append are put together once, which takes SQLAlchemy longer than SQLite takes to execute them.
 _NEXT_POSITION = select(func.coalesce(func.max(event_index.c.position), 0) + 1)
 _INSERT_ROWS = insert(event_index)
 _INSERT_FACETS = insert(event_facets)
+_INSERT_VECTORS = text("INSERT INTO event_words (position, words) VALUES (:position, CAST(:words AS tsvector))")
 _INSERT_WORDS = text("INSERT INTO event_words (rowid, words) VALUES (:position, :words)")
 OF_FACET = and_(event_facets.c.run_id == event_index.c.run_id, event_facets.c.seq == event_index.c.seq)
 _INDEXED = (
@@ -101,7 +104,7 @@ def index_all(connection: Connection) -> None:
     after = 0
     while rows := connection.execute(_INSERTED, {"after": after}).all():
         events_of_chunk = [
-            EventToIndex(run, seq, kind, actor, _plain(text)) for _, run, seq, kind, actor, text in rows
+            EventToIndex(run, seq, kind, actor, plain_payload(text)) for _, run, seq, kind, actor, text in rows
         ]
         index_events(connection, events_of_chunk)
         after = rows[-1][0]
@@ -124,7 +127,11 @@ def _write_derived(connection: Connection, placed: Sequence[tuple[int, EventToIn
     if facets:
         connection.execute(_INSERT_FACETS, facets)
     words = [{"position": place, "words": words_of(event.actor, event.payload)} for place, event in placed]
-    connection.execute(_INSERT_WORDS, words)
+    if is_postgres(connection):
+        vectors = [row | {"words": vector(str(row["words"]))} for row in words]
+        connection.execute(_INSERT_VECTORS, vectors)
+    else:
+        connection.execute(_INSERT_WORDS, words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,11 +163,11 @@ def indexed_events(connection: Connection) -> Iterator[IndexedEvent]:
             facets.setdefault(position, []).append((name, value))
         for position, run_id, seq, step, device, actor, payload in rows:
             said = facets.get(position, [])
-            yield IndexedEvent(position, run_id, seq, step, device, said, actor, _plain(payload))
+            yield IndexedEvent(position, run_id, seq, step, device, said, actor, plain_payload(payload))
         after = rows[-1].position
 
 
-def _plain(payload: str) -> Any:
+def plain_payload(payload: str) -> Any:
     """Return the plain data of a payload; None if it is not JSON."""
     try:
         return from_json(payload)
@@ -222,6 +229,20 @@ def cut_words(said: str) -> list[str]:
     return [word[:_LONGEST] for word in _WORD.findall(said.lower())]
 
 
-def phrase(words: Sequence[str], *, beginning: bool = False) -> str:
-    """Return an expression that finds these words in a row; with `beginning`, the last one also as a beginning."""
-    return f'"{" ".join(words)}"{"*" if beginning else ""}'
+def vector(words: str) -> str:
+    """Return words as a value of PostgreSQL's type tsvector, which keeps the place of each."""
+    return " ".join(f"'{word}':{min(place, _LAST_PLACE)}" for place, word in enumerate(words.split(), 1))
+
+
+def matching(connection: Connection, terms: Sequence[Sequence[str]], *, beginnings: bool = False) -> tuple[str, str]:
+    """Return a query of the positions of events that have all terms, and the value of its parameter `match`.
+
+    A term is words in a row; with `beginnings`, the last one also as the beginning of a word.
+    """
+    if is_postgres(connection):
+        end = ":*" if beginnings else ""
+        found = " & ".join("(" + " <-> ".join(f"'{word}'" for word in words) + end + ")" for words in terms)
+        return "SELECT position FROM event_words WHERE words @@ CAST(:match AS tsquery)", found
+    end = "*" if beginnings else ""
+    found = " AND ".join(f'"{" ".join(words)}"{end}' for words in terms)
+    return "SELECT rowid AS position FROM event_words WHERE event_words MATCH :match", found

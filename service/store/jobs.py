@@ -12,6 +12,7 @@ from service.core.errors import IllegalTransitionError
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, Lane
 from service.core.shown_text import storable
+from service.store.database.database import lease_now_s
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.events import append, canonical, parse_canonical
@@ -20,6 +21,8 @@ from service.store.runs import ProcessIdentity, identity_of, identity_values
 
 ACTOR = "store"  # actor of events about a worker that is gone
 CANCELLED = "JobCancelled"  # as the error of a job that a person has cancelled
+
+_NEXT_POSITION = select(func.coalesce(func.max(jobs.c.position), 0) + 1).scalar_subquery()
 
 
 def enqueue(
@@ -44,6 +47,7 @@ def enqueue(
         made = cast(JobEnqueued, event.payload)  # its texts are storable
         connection.execute(
             insert(jobs).values(
+                position=_NEXT_POSITION,
                 job_id=made.job,
                 run_id=run_id,
                 kind=made.job_kind,
@@ -90,7 +94,7 @@ def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> 
 def started(connection: Connection, clock: Clock, run_id: str) -> dict[str, str]:
     """Start time (UTC) of each job of a run that a worker computes and whose lease it renews, by the job's name."""
     running = select(jobs.c.job_id, jobs.c.started_utc).where(
-        jobs.c.run_id == run_id, jobs.c.state == "running", jobs.c.until_utc_s > clock.utc_s()
+        jobs.c.run_id == run_id, jobs.c.state == "running", jobs.c.until_utc_s > lease_now_s(connection, clock)
     )
     return {row.job_id: row.started_utc for row in connection.execute(running)}
 
@@ -134,7 +138,7 @@ def claim(
                 tries=row.tries + 1,
                 worker=worker,
                 token=ids.new_token(),
-                until_utc_s=now.timestamp() + lease_s,
+                until_utc_s=lease_now_s(connection, clock) + lease_s,
                 started_utc=utc_text(now),
                 **identity_values(ProcessIdentity.of_this_process()),
             )
@@ -148,7 +152,7 @@ def _take_over(connection: Connection, clock: Clock, row: Row[Any]) -> bool:
 
     Records the loss of its worker, and fails the job at its limit of tries.
     """
-    if clock.utc_s() < row.until_utc_s and identity_of(row).life() != "dead":
+    if lease_now_s(connection, clock) < row.until_utc_s and identity_of(row).life() != "dead":
         return False
     _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
     if row.tries < row.try_limit:
@@ -167,7 +171,7 @@ def _of_lane(lane: Lane | None) -> ColumnElement[bool]:
 def renew(connection: Connection, clock: Clock, job: Job, lease_s: float) -> Job:
     """Extend the lease on a job to `lease_s` seconds from now. Raises LeaseLostError."""
     held_row(connection, job)
-    until = clock.utc_s() + lease_s
+    until = lease_now_s(connection, clock) + lease_s
     connection.execute(update(jobs).where(jobs.c.job_id == job.job_id).values(until_utc_s=until))
     return to_job(connection.execute(select(jobs).where(jobs.c.job_id == job.job_id)).one())
 

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, Row, bindparam, delete, insert, select, updat
 from service.core.errors import StoreError
 from service.core.records.events import RunStarted, SiteOpened
 from service.store.artefacts import ArtefactFiles, insert_artefacts
-from service.store.database.engine import Database
+from service.store.database.database import Database, is_postgres, lease_now_s
 from service.store.database.tables import event_facets, event_index, heads, leases, runs
 from service.store.durable_effects import Clock, IdSource, SystemClock
 from service.store.event_index import OF_FACET
@@ -24,6 +24,12 @@ from service.store.events import ROOT, append
 from service.store.records import SITE, LeaseHeldError, LeaseLostError, NewArtefact, RunRow, UnknownRunError
 
 _ENDS = ("run_completed", "run_aborted")
+
+
+def defer_references(connection: Connection) -> None:
+    """Have rows that refer to others checked when the transaction is committed."""
+    postgres = is_postgres(connection)
+    connection.exec_driver_sql("SET CONSTRAINTS ALL DEFERRED" if postgres else "PRAGMA defer_foreign_keys = ON")
 
 
 def begin_chain(
@@ -37,7 +43,7 @@ def begin_chain(
 ) -> None:
     """Insert the row of a run, or of the site, with the first event of its chain and the artefacts of that event."""
     # The run's row holds the hash of the root event, which refers to the row; keys are checked at commit.
-    connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
+    defer_references(connection)
     connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
     (root,) = append(connection, clock, run_id, [payload], actor)
     simulated = isinstance(payload, RunStarted) and payload.simulated
@@ -191,7 +197,7 @@ class RunLease:
         """Extend the lease by its duration from now. Raises LeaseLostError if another process has taken over."""
         with self._database.writing() as connection:
             check_lease(connection, self)
-            until = self._clock.utc_s() + self._seconds
+            until = lease_now_s(connection, self._clock) + self._seconds
             connection.execute(update(leases).where(leases.c.token == self.token).values(until_utc_s=until))
 
     def release(self) -> None:
@@ -223,12 +229,12 @@ class RunLease:
 def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
     """Return whether a process that may still be alive holds the lease of a run."""
     row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
-    return row is not None and is_live(row, clock.utc_s())
+    return row is not None and is_live(row, lease_now_s(connection, clock))
 
 
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
     """Return names, sorted, of the runs whose lease is held by a process that may still be alive."""
-    now_utc_s = clock.utc_s()
+    now_utc_s = lease_now_s(connection, clock)
     rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
     return [row.run_id for row in rows if is_live(row, now_utc_s)]
 
@@ -248,7 +254,7 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
     token = ids.new_token()
     silent = _watch(database, clock, run_id, seconds)
     with database.writing() as connection:
-        now = clock.utc_s()
+        now = lease_now_s(connection, clock)
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
         if row is not None:
             if is_live(row, now) or (identity_of(row).life() == "unknown" and _renewal(row) != silent):
@@ -273,7 +279,8 @@ def _watch(database: Database, clock: Clock, run_id: str, seconds: float) -> tup
     """Return another host's lease that has run out by UTC, once the time in which it would be renewed has passed."""
     with database.reading() as connection:
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
-    if row is None or identity_of(row).life() != "unknown" or clock.utc_s() < row.until_utc_s:
+        now_utc_s = lease_now_s(connection, clock)
+    if row is None or identity_of(row).life() != "unknown" or now_utc_s < row.until_utc_s:
         return None
     _log.warning("watching for %.0f s whether %s on %s still drives %s", seconds, row.holder, row.host, run_id)
     clock.sleep(seconds)

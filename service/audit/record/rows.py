@@ -46,7 +46,8 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
             "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, e.payload "
             "FROM runs AS r LEFT JOIN heads AS h ON h.run_id = r.run_id "
             "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 "
-            "WHERE r.run_id <> :site AND (:run IS NULL OR r.run_id = :run) ORDER BY r.created_utc DESC, r.run_id DESC"
+            "WHERE r.run_id <> :site AND (CAST(:run AS TEXT) IS NULL OR r.run_id = :run) "
+            "ORDER BY r.created_utc DESC, r.run_id DESC"
         ),
         {"site": SITE, "run": None if run_id is None else plain(run_id)},
     )
@@ -254,7 +255,7 @@ def seqs_of_kind(
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND kind IN :kinds "
-            f"ORDER BY +seq {order} LIMIT :limit"  # "+": use the index on the kind, which has few rows
+            f"ORDER BY seq + 0 {order} LIMIT :limit"  # "+ 0": use the index on the kind, which has few rows
         ).bindparams(bindparam("kinds", expanding=True)),
         {"run": plain(run_id), "kinds": list(kinds), "limit": limit},
     ).scalars()

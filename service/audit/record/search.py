@@ -12,7 +12,7 @@ from sqlalchemy import Connection, bindparam, text
 from service.audit.filters import ArtefactFilter, EventFilter
 from service.audit.record.rows import LARGEST_SEQ, PAGE, EventRow, head, plain, read_rows
 from service.store.artefacts import to_artefact
-from service.store.event_index import cut_words, phrase
+from service.store.event_index import cut_words, matching
 from service.store.records import Artefact, UnknownRunError
 
 COUNT_LIMIT = 10_000  # matches of a filter beyond this number are not counted
@@ -31,10 +31,9 @@ class EventPage:
     missing: int = 0  # events missing from the index, which filters cannot find
 
 
-def search_expression(q: str) -> str | None:
-    """Return a person's words as an expression that matches each as a beginning; None if there is no word."""
-    terms = [cut for word in plain(q)[:_SEARCH_CHARACTERS].split() if (cut := cut_words(word))]
-    return " AND ".join(phrase(words, beginning=True) for words in terms[:_SEARCH_TERMS]) or None
+def search_terms(q: str) -> list[list[str]]:
+    """Return a person's words, each cut as those of the index are; some become several words in a row."""
+    return [cut for word in plain(q)[:_SEARCH_CHARACTERS].split() if (cut := cut_words(word))][:_SEARCH_TERMS]
 
 
 def events_page(
@@ -88,11 +87,12 @@ def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[st
         ),
         {"run": plain(run_id)},
     ).one()
-    conditions = ["i.position BETWEEN :low AND :high", "+i.run_id = :run"]
+    # "|| ''" keeps SQLite from using an index on these columns.
+    conditions = ["i.position BETWEEN :low AND :high", "i.run_id || '' = :run"]
     values: dict[str, Any] = {"run": plain(run_id), "low": ends[0] or 0, "high": ends[1] or -1}
     for column, value in (("kind", wanted.kind), ("step", wanted.step), ("actor", wanted.person)):
         if value:
-            conditions.append(f"+i.{column} = :{column}")
+            conditions.append(f"i.{column} || '' = :{column}")
             values[column] = plain(value)
     if wanted.device:
         conditions.append(
@@ -100,15 +100,12 @@ def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[st
         )
         values["device"] = plain(wanted.device)
     if wanted.q:
-        match = search_expression(wanted.q)
-        if match is None:
+        terms = search_terms(wanted.q)
+        if not terms:
             conditions.append("1 = 0")
         else:
-            conditions.append(
-                "i.position IN (SELECT rowid FROM event_words "
-                "WHERE event_words MATCH :match AND rowid BETWEEN :low AND :high)"
-            )
-            values["match"] = match
+            positions, values["match"] = matching(connection, terms, beginnings=True)
+            conditions.append(f"i.position IN ({positions})")
     return " AND ".join(conditions), values
 
 
@@ -120,7 +117,7 @@ def _matching(
     found = list(
         connection.execute(
             text(
-                f"SELECT i.seq FROM event_index AS i WHERE {where} AND +i.seq {beyond} :seq "
+                f"SELECT i.seq FROM event_index AS i WHERE {where} AND i.seq + 0 {beyond} :seq "
                 f"ORDER BY i.position {order} LIMIT :limit"
             ),
             values | {"seq": seq, "limit": size + 1},
@@ -135,7 +132,7 @@ def _any(connection: Connection, run_id: str, wanted: EventFilter, seq: int, *, 
 
 def _count(connection: Connection, run_id: str, wanted: EventFilter) -> int | None:
     where, values = _where(connection, run_id, wanted)
-    statement = f"SELECT count(*) FROM (SELECT 1 FROM event_index AS i WHERE {where} LIMIT :limit)"
+    statement = f"SELECT count(*) FROM (SELECT 1 FROM event_index AS i WHERE {where} LIMIT :limit) AS found"
     count = connection.execute(text(statement), values | {"limit": COUNT_LIMIT + 1}).scalar_one()
     return count if count <= COUNT_LIMIT else None
 
@@ -243,8 +240,8 @@ def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[
     for index, word in enumerate(plain(wanted.q)[:200].replace("\0", " ").split()[:8]):
         escaped = word.replace("\\", r"\\").replace("%", r"\%").replace("_", r"\_")
         columns = ("original_name", "viewpoint", "sha256", "kind", "step", "who")
-        conditions.append("(" + " OR ".join(f"{c} LIKE :word{index} ESCAPE '\\'" for c in columns) + ")")
-        values[f"word{index}"] = f"%{escaped}%"
+        conditions.append("(" + " OR ".join(f"lower({c}) LIKE :word{index} ESCAPE '\\'" for c in columns) + ")")
+        values[f"word{index}"] = f"%{escaped.lower()}%"
     return " AND ".join(conditions), values
 
 

@@ -23,6 +23,7 @@ from sqlalchemy.util import LRUCache
 from service.core.errors import StoreError
 from service.store.access import file_mode, open_new, require_access
 from service.store.database import new_schema
+from service.store.database.database import PATIENCE_S, Database
 from service.store.durable_effects import Files
 from service.store.journal import changes
 from service.store.journal.journal import REBUILD, Journal, Tail
@@ -31,7 +32,6 @@ from service.store.records import RecordDamagedError, StoreVersionError
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
-PATIENCE_S = 300.0  # for all such waits of one write: a process that is starved may hold the database for minutes
 _LOG = logging.getLogger(__name__)
 REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006")  # of migrations/versions, in order
 RESTORE = (
@@ -85,7 +85,7 @@ class _Compiled(LRUCache[Any, Any]):
 _COMPILED = _Compiled(500)
 
 
-class Database:
+class SqliteDatabase(Database):
     """Connections to one database. Writers use BEGIN IMMEDIATE, so no transaction must be upgraded and retried."""
 
     def __init__(
@@ -299,7 +299,7 @@ class Database:
             self._copy.cleanup()
 
 
-def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) -> Database:
+def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) -> SqliteDatabase:
     """Open for writing, creating or upgrading the database. A write waits up to about `patience_s` for others.
 
     Raises:
@@ -314,7 +314,7 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
         # would release the locks that SQLite holds on it in this process (POSIX).
         os.close(open_new(path, os.O_EXCL | os.O_RDONLY, file_mode(data_dir)))
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
-    database = Database(engine, path, files, patience_s, journal)
+    database = SqliteDatabase(engine, path, files, patience_s, journal)
     try:
         with database.reading() as connection:
             is_current = _revision(connection) == REVISIONS[-1]
@@ -341,7 +341,7 @@ def _require_what_the_journal_has(path: Path, journal: Journal) -> None:
         )
 
 
-def open_read_only(data_dir: Path, files: Files) -> Database:
+def open_read_only(data_dir: Path, files: Files) -> SqliteDatabase:
     """Open an existing database read-only; one of an earlier version as an upgraded copy, which is gone when closed.
 
     Raises StoreError if there is none, StoreVersionError if it is of a newer version or not of this software.
@@ -366,8 +366,8 @@ def open_read_only(data_dir: Path, files: Files) -> Database:
         return _checked_read_only(_engine(f"{address}&immutable=1", writable=False), path, files)
 
 
-def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
-    database = Database(engine, path, files)
+def _checked_read_only(engine: Engine, path: Path, files: Files) -> SqliteDatabase:
+    database = SqliteDatabase(engine, path, files)
     try:
         with database.reading() as connection:
             present = _revision(connection)
@@ -379,7 +379,7 @@ def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
         raise
 
 
-def _upgraded_copy(database: Database, path: Path, files: Files) -> Database:
+def _upgraded_copy(database: SqliteDatabase, path: Path, files: Files) -> SqliteDatabase:
     """Return a temporary copy of a database of an earlier version, upgraded; the database itself stays as it is."""
     folder = TemporaryDirectory(prefix="orthocapture-")
     copy = Path(folder.name) / DATABASE_NAME
@@ -396,7 +396,8 @@ def _upgraded_copy(database: Database, path: Path, files: Files) -> Database:
         folder.cleanup()
         raise
     database.close()
-    return Database(_engine(f"file:{quote(str(copy))}?uri=true&mode=ro", writable=False), path, files, copy=folder)
+    upgraded = _engine(f"file:{quote(str(copy))}?uri=true&mode=ro", writable=False)
+    return SqliteDatabase(upgraded, path, files, copy=folder)
 
 
 def _engine(address: str, *, writable: bool) -> Engine:

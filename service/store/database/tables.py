@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import (
     REAL,
+    BigInteger,
     CheckConstraint,
     Column,
     ForeignKey,
@@ -16,16 +17,21 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
 )
+from sqlalchemy.dialects.postgresql import DOUBLE_PRECISION
 
 metadata = MetaData()
+# PostgreSQL's REAL and INTEGER have four bytes, and its texts are sorted by the language of the server.
+_INTEGER = Integer().with_variant(BigInteger(), "postgresql")
+_REAL = REAL().with_variant(DOUBLE_PRECISION(), "postgresql")
+_TEXT = Text().with_variant(Text(collation="C"), "postgresql")
 
 runs = Table(
     "runs",
     metadata,
-    Column("run_id", Text, primary_key=True),
-    Column("created_utc", Text, nullable=False),
-    Column("simulated", Integer, nullable=False),
-    Column("root_sha256", Text, nullable=False),
+    Column("run_id", _TEXT, primary_key=True),
+    Column("created_utc", _TEXT, nullable=False),
+    Column("simulated", _INTEGER, nullable=False),
+    Column("root_sha256", _TEXT, nullable=False),
     CheckConstraint("simulated IN (0, 1)", name="runs_simulated"),
     sqlite_strict=True,
 )
@@ -33,15 +39,15 @@ runs = Table(
 events = Table(
     "events",
     metadata,
-    Column("run_id", Text, ForeignKey("runs.run_id"), nullable=False),
-    Column("seq", Integer, nullable=False),
-    Column("kind", Text, nullable=False),
-    Column("at_utc", Text, nullable=False),
-    Column("monotonic_s", REAL, nullable=False),
-    Column("actor", Text, nullable=False),
-    Column("payload", Text, nullable=False),  # RFC 8785 canonical JSON
-    Column("previous_sha256", Text, nullable=False),
-    Column("sha256", Text, nullable=False),
+    Column("run_id", _TEXT, ForeignKey("runs.run_id"), nullable=False),
+    Column("seq", _INTEGER, nullable=False),
+    Column("kind", _TEXT, nullable=False),
+    Column("at_utc", _TEXT, nullable=False),
+    Column("monotonic_s", _REAL, nullable=False),
+    Column("actor", _TEXT, nullable=False),
+    Column("payload", _TEXT, nullable=False),  # RFC 8785 canonical JSON
+    Column("previous_sha256", _TEXT, nullable=False),
+    Column("sha256", _TEXT, nullable=False),
     PrimaryKeyConstraint("run_id", "seq"),
     UniqueConstraint("run_id", "previous_sha256", name="events_no_fork"),
     CheckConstraint("seq >= 1", name="events_seq"),
@@ -54,13 +60,13 @@ events = Table(
 event_index = Table(
     "event_index",
     metadata,
-    Column("position", Integer, primary_key=True),  # over all runs, in the order of writing
-    Column("run_id", Text, nullable=False),
-    Column("seq", Integer, nullable=False),
-    Column("kind", Text, nullable=False),
-    Column("step", Text),
-    Column("device", Text),
-    Column("actor", Text, nullable=False),
+    Column("position", _INTEGER, primary_key=True),  # over all runs, in the order of writing
+    Column("run_id", _TEXT, nullable=False),
+    Column("seq", _INTEGER, nullable=False),
+    Column("kind", _TEXT, nullable=False),
+    Column("step", _TEXT),
+    Column("device", _TEXT),
+    Column("actor", _TEXT, nullable=False),
     UniqueConstraint("run_id", "seq", name="event_index_once"),
     Index("event_index_by_kind", "run_id", "kind", "seq"),
     sqlite_strict=True,
@@ -70,10 +76,10 @@ event_index = Table(
 event_facets = Table(
     "event_facets",
     metadata,
-    Column("run_id", Text, nullable=False),
-    Column("seq", Integer, nullable=False),
-    Column("name", Text, nullable=False),
-    Column("value", Text, nullable=False),
+    Column("run_id", _TEXT, nullable=False),
+    Column("seq", _INTEGER, nullable=False),
+    Column("name", _TEXT, nullable=False),
+    Column("value", _TEXT, nullable=False),
     PrimaryKeyConstraint("run_id", "seq", "name"),
     Index("event_facets_by_value", "name", "value", "run_id"),
     sqlite_strict=True,
@@ -84,31 +90,31 @@ event_facets = Table(
 heads = Table(
     "heads",
     metadata,
-    Column("run_id", Text, ForeignKey("runs.run_id"), primary_key=True),
-    Column("seq", Integer, nullable=False),
-    Column("sha256", Text, nullable=False),
+    Column("run_id", _TEXT, ForeignKey("runs.run_id"), primary_key=True),
+    Column("seq", _INTEGER, nullable=False),
+    Column("sha256", _TEXT, nullable=False),
     sqlite_strict=True,
 )
 
 artefacts = Table(
     "artefacts",
     metadata,
-    Column("run_id", Text, nullable=False),
-    Column("seq", Integer, nullable=False),  # of the event that brought it
-    Column("position", Integer, nullable=False),  # 0, 1, 2 … within that event
-    Column("sha256", Text, nullable=False),
-    Column("kind", Text, nullable=False),
-    Column("media_type", Text, nullable=False),
-    Column("size_bytes", Integer, nullable=False),
-    Column("original_name", Text, nullable=False),
-    Column("device", Text, nullable=False),
-    Column("step", Text),
-    Column("attempt", Integer),
-    Column("viewpoint", Text),
-    Column("who", Text, nullable=False),
-    Column("at_utc", Text, nullable=False),
-    Column("monotonic_s", REAL, nullable=False),
-    Column("record_sha256", Text, nullable=False),  # over all of the above and the event's sha256
+    Column("run_id", _TEXT, nullable=False),
+    Column("seq", _INTEGER, nullable=False),  # of the event that brought it
+    Column("position", _INTEGER, nullable=False),  # 0, 1, 2 … within that event
+    Column("sha256", _TEXT, nullable=False),
+    Column("kind", _TEXT, nullable=False),
+    Column("media_type", _TEXT, nullable=False),
+    Column("size_bytes", _INTEGER, nullable=False),
+    Column("original_name", _TEXT, nullable=False),
+    Column("device", _TEXT, nullable=False),
+    Column("step", _TEXT),
+    Column("attempt", _INTEGER),
+    Column("viewpoint", _TEXT),
+    Column("who", _TEXT, nullable=False),
+    Column("at_utc", _TEXT, nullable=False),
+    Column("monotonic_s", _REAL, nullable=False),
+    Column("record_sha256", _TEXT, nullable=False),  # over all of the above and the event's sha256
     PrimaryKeyConstraint("run_id", "seq", "position"),
     ForeignKeyConstraint(["run_id", "seq"], ["events.run_id", "events.seq"]),
     CheckConstraint("length(sha256) = 64", name="artefacts_hash_length"),
@@ -120,31 +126,31 @@ artefacts = Table(
 jobs = Table(
     "jobs",
     metadata,
-    Column("position", Integer, primary_key=True),  # order of claiming
-    Column("job_id", Text, nullable=False, unique=True),
-    Column("run_id", Text, nullable=False),
-    Column("kind", Text, nullable=False),
-    Column("step", Text, nullable=False),
-    Column("attempt", Integer, nullable=False),  # of the step
-    Column("idempotency_key", Text, nullable=False),
-    Column("arguments", Text, nullable=False),  # RFC 8785 canonical JSON
-    Column("state", Text, nullable=False),
-    Column("tries", Integer, nullable=False),  # how often a worker has claimed it
-    Column("try_limit", Integer, nullable=False),
-    Column("enqueued_seq", Integer, nullable=False),
-    Column("enqueued_utc", Text, nullable=False),
-    Column("started_utc", Text),
-    Column("ended_utc", Text),
-    Column("ended_seq", Integer),
-    Column("error", Text),
-    Column("worker", Text),
-    Column("token", Text),
-    Column("until_utc_s", REAL),
-    Column("host", Text),
-    Column("boot", Text),
-    Column("pid", Integer),
-    Column("process_started_s", REAL),
-    Column("priority", Integer, nullable=False, server_default="1"),  # smaller is claimed first
+    Column("position", _INTEGER, primary_key=True),  # order of claiming
+    Column("job_id", _TEXT, nullable=False, unique=True),
+    Column("run_id", _TEXT, nullable=False),
+    Column("kind", _TEXT, nullable=False),
+    Column("step", _TEXT, nullable=False),
+    Column("attempt", _INTEGER, nullable=False),  # of the step
+    Column("idempotency_key", _TEXT, nullable=False),
+    Column("arguments", _TEXT, nullable=False),  # RFC 8785 canonical JSON
+    Column("state", _TEXT, nullable=False),
+    Column("tries", _INTEGER, nullable=False),  # how often a worker has claimed it
+    Column("try_limit", _INTEGER, nullable=False),
+    Column("enqueued_seq", _INTEGER, nullable=False),
+    Column("enqueued_utc", _TEXT, nullable=False),
+    Column("started_utc", _TEXT),
+    Column("ended_utc", _TEXT),
+    Column("ended_seq", _INTEGER),
+    Column("error", _TEXT),
+    Column("worker", _TEXT),
+    Column("token", _TEXT),
+    Column("until_utc_s", _REAL),
+    Column("host", _TEXT),
+    Column("boot", _TEXT),
+    Column("pid", _INTEGER),
+    Column("process_started_s", _REAL),
+    Column("priority", _INTEGER, nullable=False, server_default="1"),  # smaller is claimed first
     ForeignKeyConstraint(["run_id", "enqueued_seq"], ["events.run_id", "events.seq"]),
     UniqueConstraint("run_id", "idempotency_key", name="jobs_idempotency"),
     CheckConstraint("state IN ('queued', 'running', 'finished', 'failed')", name="jobs_state"),
@@ -155,14 +161,14 @@ jobs = Table(
 leases = Table(
     "leases",
     metadata,
-    Column("run_id", Text, ForeignKey("runs.run_id"), primary_key=True),
-    Column("holder", Text, nullable=False),
-    Column("token", Text, nullable=False),
-    Column("until_utc_s", REAL, nullable=False),
-    Column("host", Text, nullable=False),
-    Column("boot", Text, nullable=False),
-    Column("pid", Integer, nullable=False),
-    Column("process_started_s", REAL, nullable=False),
+    Column("run_id", _TEXT, ForeignKey("runs.run_id"), primary_key=True),
+    Column("holder", _TEXT, nullable=False),
+    Column("token", _TEXT, nullable=False),
+    Column("until_utc_s", _REAL, nullable=False),
+    Column("host", _TEXT, nullable=False),
+    Column("boot", _TEXT, nullable=False),
+    Column("pid", _INTEGER, nullable=False),
+    Column("process_started_s", _REAL, nullable=False),
     sqlite_strict=True,
 )
 
@@ -170,15 +176,15 @@ leases = Table(
 checkpoints = Table(
     "checkpoints",
     metadata,
-    Column("run_id", Text, nullable=False),
-    Column("seq", Integer, nullable=False),  # of the last event that it covers
-    Column("sha256", Text, nullable=False),  # of that event
-    Column("artefacts_sha256", Text, nullable=False),  # over record_sha256 of the artefact rows up to it
-    Column("site_seq", Integer, nullable=False),  # end of the site's chain, which tells the valid key
-    Column("site_sha256", Text, nullable=False),
-    Column("at_utc", Text, nullable=False),
-    Column("key_id", Text, nullable=False),  # SHA-256 of the raw public key
-    Column("signature", Text, nullable=False),  # base64, Ed25519 over service.store.signatures.checkpoints.statement
+    Column("run_id", _TEXT, nullable=False),
+    Column("seq", _INTEGER, nullable=False),  # of the last event that it covers
+    Column("sha256", _TEXT, nullable=False),  # of that event
+    Column("artefacts_sha256", _TEXT, nullable=False),  # over record_sha256 of the artefact rows up to it
+    Column("site_seq", _INTEGER, nullable=False),  # end of the site's chain, which tells the valid key
+    Column("site_sha256", _TEXT, nullable=False),
+    Column("at_utc", _TEXT, nullable=False),
+    Column("key_id", _TEXT, nullable=False),  # SHA-256 of the raw public key
+    Column("signature", _TEXT, nullable=False),  # base64, Ed25519 over service.store.signatures.checkpoints.statement
     PrimaryKeyConstraint("run_id", "seq"),
     ForeignKeyConstraint(["run_id", "seq"], ["events.run_id", "events.seq"]),
     sqlite_strict=True,
@@ -188,11 +194,11 @@ checkpoints = Table(
 timestamps = Table(
     "timestamps",
     metadata,
-    Column("run_id", Text, nullable=False),
-    Column("seq", Integer, nullable=False),  # of the checkpoint
-    Column("authority", Text, nullable=False),
-    Column("at_utc", Text, nullable=False),
-    Column("token", Text, nullable=False),  # base64 of the DER TimeStampResp
+    Column("run_id", _TEXT, nullable=False),
+    Column("seq", _INTEGER, nullable=False),  # of the checkpoint
+    Column("authority", _TEXT, nullable=False),
+    Column("at_utc", _TEXT, nullable=False),
+    Column("token", _TEXT, nullable=False),  # base64 of the DER TimeStampResp
     PrimaryKeyConstraint("run_id", "seq", "authority"),
     ForeignKeyConstraint(["run_id", "seq"], ["checkpoints.run_id", "checkpoints.seq"]),
     sqlite_strict=True,
@@ -202,16 +208,16 @@ timestamps = Table(
 accounts = Table(
     "accounts",
     metadata,
-    Column("account", Text, primary_key=True),  # the name to sign in with
-    Column("full_name", Text, nullable=False),
-    Column("role", Text, nullable=False),
-    Column("state", Text, nullable=False),
-    Column("password_hash", Text, nullable=False),  # argon2id; "" while invited
-    Column("pin_hash", Text, nullable=False),  # argon2id; "" for none
-    Column("failures", Integer, nullable=False),  # in a row
-    Column("locked_until_utc_s", REAL, nullable=False),
-    Column("created_utc", Text, nullable=False),
-    Column("badge_hash", Text, nullable=False, server_default=""),  # argon2id; "" for none
+    Column("account", _TEXT, primary_key=True),  # the name to sign in with
+    Column("full_name", _TEXT, nullable=False),
+    Column("role", _TEXT, nullable=False),
+    Column("state", _TEXT, nullable=False),
+    Column("password_hash", _TEXT, nullable=False),  # argon2id; "" while invited
+    Column("pin_hash", _TEXT, nullable=False),  # argon2id; "" for none
+    Column("failures", _INTEGER, nullable=False),  # in a row
+    Column("locked_until_utc_s", _REAL, nullable=False),
+    Column("created_utc", _TEXT, nullable=False),
+    Column("badge_hash", _TEXT, nullable=False, server_default=""),  # argon2id; "" for none
     CheckConstraint("role IN ('technician', 'supervisor', 'auditor', 'administrator')", name="accounts_role"),
     CheckConstraint("state IN ('invited', 'active', 'disabled')", name="accounts_state"),
     sqlite_strict=True,
@@ -221,24 +227,24 @@ accounts = Table(
 invitations = Table(
     "invitations",
     metadata,
-    Column("token_sha256", Text, primary_key=True),
-    Column("account", Text, nullable=False),  # "" for the first administrator, who chooses one
-    Column("expires_utc_s", REAL, nullable=False),
-    Column("used", Integer, nullable=False),
+    Column("token_sha256", _TEXT, primary_key=True),
+    Column("account", _TEXT, nullable=False),  # "" for the first administrator, who chooses one
+    Column("expires_utc_s", _REAL, nullable=False),
+    Column("used", _INTEGER, nullable=False),
     sqlite_strict=True,
 )
 
 sessions = Table(
     "sessions",
     metadata,
-    Column("token_sha256", Text, primary_key=True),
-    Column("account", Text, ForeignKey("accounts.account"), nullable=False),
-    Column("screen", Text, nullable=False, unique=True),  # a short name for people and for the record
-    Column("csrf", Text, nullable=False),
-    Column("created_utc_s", REAL, nullable=False),
-    Column("seen_utc_s", REAL, nullable=False),  # last action of the person; the page's own requests do not count
-    Column("locked", Integer, nullable=False),
-    Column("pin_failures", Integer, nullable=False),
+    Column("token_sha256", _TEXT, primary_key=True),
+    Column("account", _TEXT, ForeignKey("accounts.account"), nullable=False),
+    Column("screen", _TEXT, nullable=False, unique=True),  # a short name for people and for the record
+    Column("csrf", _TEXT, nullable=False),
+    Column("created_utc_s", _REAL, nullable=False),
+    Column("seen_utc_s", _REAL, nullable=False),  # last action of the person; the page's own requests do not count
+    Column("locked", _INTEGER, nullable=False),
+    Column("pin_failures", _INTEGER, nullable=False),
     sqlite_strict=True,
 )
 
@@ -246,11 +252,11 @@ sessions = Table(
 control = Table(
     "control",
     metadata,
-    Column("run_id", Text, ForeignKey("runs.run_id"), primary_key=True),
-    Column("screen", Text, nullable=False),  # "" for nobody
-    Column("account", Text, nullable=False),
-    Column("asked_by_screen", Text, nullable=False),
-    Column("asked_by_account", Text, nullable=False),
-    Column("asked_utc_s", REAL, nullable=False),  # negative: that was refused, at the time without the sign
+    Column("run_id", _TEXT, ForeignKey("runs.run_id"), primary_key=True),
+    Column("screen", _TEXT, nullable=False),  # "" for nobody
+    Column("account", _TEXT, nullable=False),
+    Column("asked_by_screen", _TEXT, nullable=False),
+    Column("asked_by_account", _TEXT, nullable=False),
+    Column("asked_utc_s", _REAL, nullable=False),  # negative: that was refused, at the time without the sign
     sqlite_strict=True,
 )

@@ -1,0 +1,226 @@
+"""The PostgreSQL database of a site: opening, preparing, and the two kinds of transaction.
+
+Two roles: the owner of the tables prepares and upgrades them and is used for nothing else; the role of the program
+may read and insert evidence, and change only what is of the moment. Writers wait for one another (an advisory lock
+that ends with the transaction), so that a chain has one end and positions follow the order of commits.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, text
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+
+from service.core.errors import ConfigurationError, StoreError
+from service.store.database import postgres_schema
+from service.store.database.database import PATIENCE_S, Database
+from service.store.durable_effects import Files
+from service.store.records import StoreVersionError
+
+_LOG = logging.getLogger(__name__)
+_WRITERS = 0x6F727468  # the advisory lock that writers hold; any number that nobody else uses
+_LOCK_TIMEOUT_S = 30  # of one wait for another writer; then a warning is logged
+_HUNG_S = 120  # a client that does nothing within a transaction for so long loses it, so that a site goes on
+_AGAIN_S = 0.5
+_LOCK_NOT_AVAILABLE = "55P03"
+_COMMITTED, _ABORTED = "committed", "aborted"
+LOOK = "Look at the database server: does it run, can this machine reach it, has it room? What was recorded is safe"
+
+
+def engine_for(url: str) -> Engine:
+    """Return an engine for the address of a PostgreSQL database. Raises StoreError, ConfigurationError."""
+    try:
+        address = make_url(url).set(drivername="postgresql+psycopg")
+        options = f"-c lock_timeout={_LOCK_TIMEOUT_S}s -c idle_in_transaction_session_timeout={_HUNG_S}s"
+        return create_engine(address, connect_args={"options": options, "connect_timeout": 10}, pool_pre_ping=True)
+    except (ArgumentError, NoSuchModuleError) as error:
+        raise StoreError(
+            f"this is not the address of a database: {error}",
+            remedy="Write postgresql://USER@HOST/DATABASE; the password belongs into ~/.pgpass or PGPASSWORD",
+        ) from error
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            "PostgreSQL is used with the package psycopg, which is not installed",
+            remedy='Install it: python -m pip install "orthocapture[site]"',
+        ) from error
+
+
+class PostgresDatabase(Database):
+    """Connections of the program's role to one PostgreSQL database."""
+
+    def __init__(self, engine: Engine, files: Files, patience_s: float = PATIENCE_S) -> None:
+        self._engine = engine
+        self._files = files
+        self._patience_s = patience_s
+        self.where = engine.url.render_as_string(hide_password=True)
+
+    @contextmanager
+    def reading(self) -> Generator[Connection]:
+        """Yield a read transaction: one consistent snapshot. Raises StoreError."""
+        with _store_errors(self.where), self._engine.connect() as plain:
+            connection = plain.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+            with connection.begin():
+                yield connection
+
+    @contextmanager
+    def writing(self) -> Generator[Connection]:
+        """Yield a write transaction: commits at the end, rolls back on any exception. Raises StoreError."""
+        with _store_errors(self.where), self._engine.connect() as connection:
+            self._begin(connection)
+            transaction = connection.get_transaction()
+            assert transaction is not None  # the first statement has begun it
+            try:
+                number = connection.execute(text("SELECT txid_current()")).scalar_one()
+                yield connection
+            except BaseException:
+                if not connection.invalidated:
+                    transaction.rollback()
+                raise
+            try:
+                self._files.commit(transaction.commit)
+            except DBAPIError as error:
+                if not error.connection_invalidated:
+                    raise
+                self._require_committed(int(number), error)
+
+    def _begin(self, connection: Connection) -> None:
+        """Wait until no other process writes, and keep the others waiting until the transaction ends."""
+        began_s = time.monotonic()
+        while True:
+            try:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:writers)"), {"writers": _WRITERS})
+            except DBAPIError as error:
+                connection.rollback()
+                waited_s = time.monotonic() - began_s
+                if getattr(error.orig, "sqlstate", "") != _LOCK_NOT_AVAILABLE or waited_s >= self._patience_s:
+                    raise
+                _LOG.warning("another process has held %s for %.0f s; waiting for it", self.where, waited_s)
+            else:
+                return
+
+    def _require_committed(self, number: int, lost: DBAPIError) -> None:
+        """Ask whether the transaction whose connection was lost at its commit was committed. Raises StoreError."""
+        began_s = time.monotonic()
+        while True:
+            try:
+                with self._engine.connect() as connection:
+                    asked = text("SELECT txid_status(:number)")
+                    status = connection.execute(asked, {"number": number}).scalar_one_or_none()
+            except DBAPIError:
+                status = None
+            if status == _COMMITTED:
+                return
+            if status == _ABORTED:
+                raise StoreError(
+                    "the connection to the database was lost, and nothing of this was recorded",
+                    where=self.where,
+                    remedy=LOOK,
+                ) from lost
+            if time.monotonic() - began_s >= self._patience_s:
+                raise StoreError(
+                    "the connection to the database was lost, and whether this was recorded is not known",
+                    where=self.where,
+                    remedy=f"{LOOK}; then look at the end of the run before you repeat anything",
+                ) from lost
+            time.sleep(_AGAIN_S)
+
+    def require_in_place(self) -> None:
+        """Do nothing: a server keeps its own files."""
+
+    def require_record(self) -> None:
+        """Raise StoreError unless the server answers."""
+        with self.reading() as connection:
+            connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+
+def open_postgres(url: str, files: Files, patience_s: float = PATIENCE_S) -> PostgresDatabase:
+    """Open the prepared database of a site as the program's role.
+
+    Raises:
+        StoreVersionError: another version prepared it, or nobody did.
+        StoreError: it cannot be reached, or the role owns the tables and so could change the evidence.
+    """
+    database = PostgresDatabase(engine_for(url), files, patience_s)
+    try:
+        with database.reading() as connection:
+            require_prepared(connection, database.where)
+            require_no_owner(connection, database.where)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def require_prepared(connection: Connection, where: str) -> None:
+    """Raise StoreVersionError unless this version's tables are there."""
+    there = connection.execute(text("SELECT to_regclass('alembic_version') IS NOT NULL")).scalar_one()
+    found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar() if there else None
+    if found != postgres_schema.REVISION:
+        raise StoreVersionError(
+            f"this database is of another version ({found})" if found else "this database has not been prepared",
+            where=where,
+            remedy="Prepare it as its owner: orthocapture store prepare URL-OF-THE-OWNER --role ROLE",
+        )
+
+
+def require_no_owner(connection: Connection, where: str) -> None:
+    """Raise StoreError if this role may change evidence: it owns tables, is a superuser, or was granted too much."""
+    powers = powers_over_evidence(connection)
+    if powers:
+        role = connection.execute(text("SELECT current_user")).scalar_one()
+        raise StoreError(
+            f"the role {role} {powers[0]}: it could change the evidence",
+            where=where,
+            remedy="Connect as a role that does not own the tables; `orthocapture store prepare --role` grants one",
+        )
+
+
+def powers_over_evidence(connection: Connection) -> list[str]:
+    """Return what this role may do that would change evidence; empty if it may only read and insert it."""
+    found: list[str] = []
+    if connection.execute(text("SELECT rolsuper FROM pg_roles WHERE rolname = current_user")).scalar_one():
+        found.append("is a superuser")
+    for table in postgres_schema.EVIDENCE:
+        owner = text("SELECT pg_has_role(relowner, 'USAGE') FROM pg_class WHERE oid = to_regclass(:name)")
+        if connection.execute(owner, {"name": table}).scalar():
+            found.append(f"owns the table {table}")
+        for power in ("UPDATE", "DELETE", "TRUNCATE", "TRIGGER"):
+            may = text("SELECT has_table_privilege(current_user, :name, :power)")
+            if connection.execute(may, {"name": table, "power": power}).scalar():
+                found.append(f"may {power} on {table}")
+    return found
+
+
+def prepare(owner_url: str, role: str) -> None:
+    """Make the tables of a site as their owner, and grant the program's role what it needs. Raises StoreError."""
+    engine = engine_for(owner_url)
+    where = engine.url.render_as_string(hide_password=True)
+    try:
+        with _store_errors(where), engine.begin() as connection:
+            postgres_schema.make(connection, role)
+    finally:
+        engine.dispose()
+
+
+@contextmanager
+def _store_errors(where: str) -> Generator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        raise StoreError(f"the database refused: {_first_line(error.orig)}", where=where, remedy=LOOK) from error
+    except SQLAlchemyError as error:
+        raise StoreError(f"the database refused: {error}", where=where, remedy=LOOK) from error
+
+
+def _first_line(error: Any) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
