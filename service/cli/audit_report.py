@@ -133,7 +133,8 @@ def _record(data: Path, run_id: str, head_sha256: str, actor: str, part: Path, f
 
 def _writable(data: Path) -> bool:
     """Return whether anything can be recorded; an auditor's copy may be on a read-only medium."""
-    return os.access(data, os.W_OK) and os.access(database_path(data), os.W_OK)
+    path = database_path(data)
+    return os.access(data, os.W_OK) and (not path.exists() or os.access(path, os.W_OK))
 
 
 def figures_command(

@@ -41,7 +41,7 @@ from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.station import Station
 from service.steps import params_models
-from service.store.database.engine import database_path
+from service.store.database.opening import has_database
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import Clock, DurableFiles, SystemClock
 from service.store.mounts import why_unsafe
@@ -183,7 +183,7 @@ def _offset_words(offset_s: float, clock: Literal["utc", "uptime"], *, late: boo
 
 
 def _foresee(data: Path, protocol: Protocol, free_bytes: int, *, simulated: bool) -> Forecast:
-    if not database_path(data).is_file():
+    if not has_database(data):
         return forecast(protocol, None, Usage(), None, free_bytes, simulated=simulated)
     with Store.open(data, create=False) as store:
         return forecast_of(store, protocol, simulated=simulated)

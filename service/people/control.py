@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, Literal
 
-from sqlalchemy import Connection, Row, select
-from sqlalchemy.dialects.sqlite import insert
+from sqlalchemy import Connection, Row, insert, select, update
 
 from service.core.records.base import age_s
 from service.core.records.events import ControlTaken
@@ -234,12 +233,10 @@ class Control:
         )
 
     def _write(self, connection: Connection, run_id: str, **values: object) -> None:
-        nobody = {"screen": "", "account": "", **_NOBODY_ASKS}
-        connection.execute(
-            insert(control)
-            .values(run_id=run_id, **{**nobody, **values})
-            .on_conflict_do_update(index_elements=["run_id"], set_=values)
-        )
+        changed = connection.execute(update(control).where(control.c.run_id == run_id).values(**values))
+        if not changed.rowcount:
+            nobody = {"screen": "", "account": "", **_NOBODY_ASKS}
+            connection.execute(insert(control).values(run_id=run_id, **{**nobody, **values}))
 
 
 def _full_name(connection: Connection, account: str) -> str:

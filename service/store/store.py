@@ -19,15 +19,9 @@ from service.core.shown_text import storable
 from service.store import jobs as queue
 from service.store.access import close_to_others, require_access
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
-from service.store.database.engine import (
-    DATABASE_NAME,
-    LOOK,
-    PATIENCE_S,
-    RESTORE,
-    Database,
-    database_path,
-    open_database,
-)
+from service.store.database.database import PATIENCE_S, Database
+from service.store.database.engine import DATABASE_NAME, LOOK, RESTORE, database_path
+from service.store.database.opening import open_database, require_database
 from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Ages, Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.events import append, read_events, to_event
@@ -108,12 +102,8 @@ class Store:
         files = files or DurableFiles()
         ids = ids or RandomIds()
         require_access(data_dir)
-        if not create and not database_path(data_dir).is_file():
-            raise StoreError(
-                "there is no run data here",
-                where=str(database_path(data_dir)),
-                remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
-            )
+        if not create:
+            require_database(data_dir)
         folder = open_folder(data_dir, files, ids)
         require_own_mount(data_dir)
         close_to_others(data_dir, DATABASE_NAME)

@@ -104,7 +104,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
             unlisted = functools.cache(file_checks.unlisted_files)
             stack.enter_context(patch.object(audit, "unlisted_files", unlisted))
         stack.enter_context(
-            patch.object(audit, "content_faults", _remembered_contents(database_stays=database_stays))
+            patch.object(search_checks, "content_faults", _remembered_contents(database_stays=database_stays))
         )
         gc.disable()
         stack.callback(gc.enable)

@@ -16,7 +16,7 @@ from service.core.run.state import RunState
 from service.people.rows import full_names, named
 from service.steps import params_models
 from service.store.artefacts import ArtefactFiles, read_artefacts
-from service.store.database.engine import open_read_only
+from service.store.database.opening import open_read_only
 from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
 from service.store.records import Artefact

@@ -23,6 +23,7 @@ from service.store.access import KEYS, PEPPER
 from service.store.artefacts import chunks_of, hash_file, relative_path
 from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
+from service.store.database.opening import require_sqlite
 from service.store.database.tables import artefacts, event_index, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
 from service.store.journal.lines import NAME as JOURNAL_NAME
@@ -89,6 +90,7 @@ def back_up(
         StoreError: there is no data, or the destination is unusable or too small; no backup was made.
         IntegrityError: a written file does not read back as it was; no backup was made.
     """
+    require_sqlite(data_dir)
     folder = BackupFolder(destination, files or DurableFiles(), RandomIds())
     here, there = data_dir.resolve(), destination.resolve()
     if here == there or here in there.parents or there in here.parents:

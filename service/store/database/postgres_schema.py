@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from sqlalchemy import Connection, text
 
 from service.store.database.tables import metadata
@@ -10,12 +12,39 @@ REVISION = "0006"  # as of the migrations: a database that was prepared by an ea
 EVIDENCE = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index", "event_facets", "event_words")
 _ENDS = ("heads",)  # inserted and moved, never removed
 _OF_THE_MOMENT = ("jobs", "leases", "accounts", "invitations", "sessions", "control")
-_REFUSE = """
-CREATE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS $$
+_REFUSAL = """
 BEGIN
   RAISE EXCEPTION '% is append-only: % refused', TG_TABLE_NAME, lower(TG_OP);
-END $$
-"""
+END """
+_REFUSE = f"CREATE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS $${_REFUSAL}$$"
+# What these tables have beside the columns and constraints of service.store.database.tables.
+FURTHER_COLUMNS: Mapping[tuple[str, str], object] = {
+    ("alembic_version", "version_num"): ("character varying(32)", True),
+    ("checkpoints", "rowid"): ("bigint", True),
+    ("event_words", "position"): ("bigint", True),
+    ("event_words", "words"): ("tsvector", True),
+}
+FURTHER_CONSTRAINTS = {("alembic_version", "alembic_version_pkey"), ("event_words", "event_words_pkey")}
+_EVERY_ROW = 1 + 2 + 8 + 16  # of pg_trigger.tgtype: for each row, before, delete, update
+_EVERY_TRUNCATE = 2 + 32  # before, truncate
+
+
+def triggers() -> dict[tuple[str, str], object]:
+    """Return by table and name how each trigger is enabled, its type as in pg_trigger, and what it does."""
+    found: dict[tuple[str, str], object] = {}
+    for table in EVIDENCE:
+        found[table, f"{table}_append_only"] = ("O", _EVERY_ROW, _REFUSAL)
+        found[table, f"{table}_no_truncate"] = ("O", _EVERY_TRUNCATE, _REFUSAL)
+    return found
+
+
+def granted(table: str) -> tuple[str, ...]:
+    """Return what the program's role may do with a table."""
+    if table in EVIDENCE:
+        return ("SELECT", "INSERT")
+    if table in _ENDS:
+        return ("SELECT", "INSERT", "UPDATE")
+    return ("SELECT", "INSERT", "UPDATE", "DELETE") if table in _OF_THE_MOMENT else ("SELECT",)
 
 
 def make(connection: Connection, role: str) -> None:
@@ -48,8 +77,8 @@ def _statements(role: str) -> list[str]:
                 "FOR EACH STATEMENT EXECUTE FUNCTION refuse_change()",
             )
         ),
-        f"GRANT SELECT ON alembic_version TO {quoted}",
-        *(f"GRANT SELECT, INSERT ON {table} TO {quoted}" for table in EVIDENCE),
-        *(f"GRANT SELECT, INSERT, UPDATE ON {table} TO {quoted}" for table in _ENDS),
-        *(f"GRANT SELECT, INSERT, UPDATE, DELETE ON {table} TO {quoted}" for table in _OF_THE_MOMENT),
+        *(
+            f"GRANT {', '.join(granted(table))} ON {table} TO {quoted}"
+            for table in ("alembic_version", *EVIDENCE, *_ENDS, *_OF_THE_MOMENT)
+        ),
     ]

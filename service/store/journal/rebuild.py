@@ -20,6 +20,7 @@ from service.store.access import KEYS
 from service.store.artefacts import relative_path
 from service.store.backup.folder import folder_errors
 from service.store.database.engine import DATABASE_NAME, database_path, open_database, open_read_only
+from service.store.database.opening import require_sqlite
 from service.store.durable_effects import Clock, DurableFiles, Files, SystemClock, utc_text
 from service.store.event_index import index_all
 from service.store.journal import changes
@@ -100,6 +101,7 @@ def rebuild(
         StoreError: there is nothing to rebuild from, or the folder cannot be written; nothing was changed.
         OrthocaptureError: raised by `actor`; nothing was changed.
     """
+    require_sqlite(data_dir)
     files, clock = files or DurableFiles(), clock or SystemClock()
     stamp = utc_text(clock.utc_now()).replace(":", "").replace("-", "")
     surveyed, found = survey(journal or data_dir / NAME), _look(data_dir)

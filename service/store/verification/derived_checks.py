@@ -30,14 +30,14 @@ _PLACES = """
 SELECT run_id AS run_id, seq AS seq, place AS place, before AS before,
        position - row_number() OVER (ORDER BY position) AS gap
 FROM (SELECT run_id, seq, position, position AS place,
-             lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index)
+             lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index) AS placed
 ORDER BY position
 """
 # CROSS JOIN makes SQLite look up the event of each job; otherwise it may scan all jobs for each event.
 _QUEUE = """
 SELECT j.run_id AS run_id, j.enqueued_seq AS enqueued_seq, j.job_id AS job_id, j.position AS position,
        row_number() OVER (ORDER BY i.position) AS place
-FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
+FROM jobs AS j CROSS JOIN event_index AS i WHERE i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # made by ANALYZE, which is harmless
 _NUMBERS = ("application_id",)  # in the database's header, which this software leaves 0

@@ -8,6 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, select, text
 
+from service.store.database.database import is_postgres
 from service.store.database.tables import (
     accounts,
     artefacts,
@@ -88,7 +89,9 @@ def read_evidence(connection: Connection, run_id: str | None) -> EvidenceRows:
 
 
 def database_damage(connection: Connection) -> tuple[str, ...]:
-    """Return the messages of SQLite's own check of the database; empty if it is sound."""
+    """Return the messages of SQLite's own check of the database; empty if it is sound, or of a server."""
+    if is_postgres(connection):
+        return ()
     found = connection.execute(text("PRAGMA integrity_check(5)")).scalars()
     return tuple(f"SQLite finds the database damaged: {line}" for line in found if line != "ok")
 

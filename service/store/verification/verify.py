@@ -11,7 +11,9 @@ from sqlalchemy import Connection
 
 from service.core.errors import StoreError
 from service.store.artefacts import read_artefacts
-from service.store.database.engine import DATABASE_NAME, RESTORE, Database, database_path, open_read_only
+from service.store.database.database import Database, is_postgres
+from service.store.database.engine import DATABASE_NAME, RESTORE, database_path
+from service.store.database.opening import open_read_only
 from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
@@ -23,12 +25,12 @@ from service.store.signatures.log import LogLine, log_findings, read_log, writte
 from service.store.signatures.second_place import copy_faults
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
+from service.store.verification import postgres_checks, search_checks
 from service.store.verification import signature_checks as signatures
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
 from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
 from service.store.verification.file_checks import Progress, hash_files, unlisted_files
 from service.store.verification.people_checks import people_faults
-from service.store.verification.search_checks import content_faults
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ def verify(
         UnknownRunError: there is no such run.
         StoreError: there is no database, or it cannot be read.
     """
-    of_wal, notes_of_wal = wal_findings(data_dir)
+    of_wal, notes_of_wal = wal_findings(data_dir)  # of SQLite; a server has no such file here
     database = open_read_only(data_dir, DurableFiles())
     try:
         # Before the database's snapshot: a signature made meanwhile is in the database first, and then in the log.
@@ -112,7 +114,11 @@ def verify(
         with database.reading() as connection, _damage_named(data_dir, connection):
             report = _verify(data_dir, connection, lines, run_id, progress, certificates, with_files=files)
             runs = None if run_id is None else [run_id]
-            of_journal, notes_of_journal = journal_findings(data_dir, connection, runs, lambda: _held_now(database))
+            of_journal, notes_of_journal = (
+                ([], [])
+                if is_postgres(connection)
+                else journal_findings(data_dir, connection, runs, lambda: _held_now(database))
+            )
     finally:
         database.close()
     faults = (*report.faults, *of_wal, *of_journal)
@@ -258,11 +264,12 @@ class _SignatureCheck:
 
 def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
     """Yield faults of the schema and of what is derived from the events: references, indexes, queue, words."""
-    yield from derived.schema_faults(connection)
-    yield from derived.reference_faults(connection)
+    postgres = is_postgres(connection)
+    yield from (postgres_checks if postgres else derived).schema_faults(connection)
+    yield from (postgres_checks if postgres else derived).reference_faults(connection)
     yield from derived.index_faults(connection, runs, every_run=every_run)
     yield from derived.queue_faults(connection, runs)
-    yield from content_faults(connection, runs, every_run=every_run)
+    yield from (postgres_checks if postgres else search_checks).content_faults(connection, runs, every_run=every_run)
 
 
 def _counted(
