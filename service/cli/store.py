@@ -24,6 +24,8 @@ from service.core.text.words import counted
 from service.core.units import gigabytes
 from service.store.backup.backup import BackupOptions, BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore
+from service.store.copying import copy_record
+from service.store.database.postgres import prepare
 from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.journal.rebuild import RebuildReport, rebuild
 from service.store.records import SITE
@@ -213,6 +215,58 @@ def store() -> None:
 store_app.command("backup")(backup_command)
 store_app.command("restore")(restore_command)
 store_app.command("rebuild")(rebuild_command)
+
+
+@store_app.command("prepare")
+def prepare_command(
+    owner_url: Annotated[
+        str, typer.Argument(metavar="URL", help="postgresql://OWNER@HOST/DATABASE, as the owner of the tables.")
+    ],
+    role: Annotated[str, typer.Option("--role", help="The role of the program, which may not change evidence.")],
+) -> None:
+    """Make the tables of a site in an empty PostgreSQL database, and grant the program's role what it needs.
+
+    The owner is used for nothing else. The role must exist: CREATE ROLE orthocapture LOGIN.
+    """
+    with reporting_errors():
+        prepare(owner_url, role)
+    console.print(f"The database is prepared for the role {role}. Write its address into a site.yaml:")
+    console.print("  database: postgresql://ROLE@HOST/DATABASE", markup=False)
+
+
+@store_app.command("copy")
+def copy_command(
+    source: Annotated[Path, typer.Argument(metavar="FROM", help="Data folder to copy; it is only read.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="TO", help="Data folder to copy to: new, or with nothing but a site.yaml.")
+    ],
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Copy a whole record with its files, accounts and keys, from SQLite to PostgreSQL or back.
+
+    End every process of the source first: what is recorded there afterwards is not in the copy. The exit status is 1
+    if a file of the record was missing or altered.
+    """
+
+    def actor(folder: Path) -> str:
+        with Store.open(folder, create=False) as store:
+            return acting_person(store, operator, password_stdin=password_stdin).name
+
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        made = copy_record(source, target, actor=actor, progress=progress)
+    if json:
+        print_json({**made.recorded.model_dump(mode="json"), "missing": list(made.missing)})
+    else:
+        done = made.recorded
+        console.print(f"Copied: {counted(done.runs, 'run')}, {counted(done.events, 'event')}, {done.files} files.")
+        console.print(f"  heads: {done.heads_sha256}")
+        for line in made.missing:
+            console.tell("  ", ("not copied:", "red"), f" {line}")
+        console.print("  Run: orthocapture audit verify all --data TO", markup=False)
+    if made.missing:
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 @store_app.command("gc")

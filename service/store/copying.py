@@ -1,15 +1,20 @@
-"""Copy the record of a site, or one run, from one database to another; the chains keep their hashes."""
+"""Copy the record of a site between data folders, from SQLite to PostgreSQL or back; the chains keep their hashes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Table, func, insert, select
 
 from service.core.errors import StoreError
-from service.store.database.database import Database
+from service.core.records.events import RecordCopied
+from service.store.access import KEYS
+from service.store.artefacts import ArtefactFiles, chunks_of, relative_path
+from service.store.backup.folder import folder_errors
+from service.store.database.opening import open_read_only
 from service.store.database.tables import (
     accounts,
     artefacts,
@@ -22,63 +27,175 @@ from service.store.database.tables import (
     runs,
     timestamps,
 )
+from service.store.durable_effects import DurableFiles, Files, RandomIds
 from service.store.event_index import EventToIndex, index_events, plain_payload
+from service.store.events import canonical, sha256_text
+from service.store.records import SITE
 from service.store.runs import defer_references
+from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.signing import checkpoint
+from service.store.store import Store
 
 _AT_ONCE = 500  # rows
-_OF_RUNS = (runs, heads, artefacts, checkpoints, timestamps)
-_OF_THE_SITE = (accounts, invitations)
+_TABLES = (heads, artefacts, checkpoints, timestamps, accounts, invitations)
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Copied:
-    """What was copied: number of rows by table, and the last hash of each chain."""
+class CopyReport:
+    """What was copied."""
 
-    rows: dict[str, int]
-    heads: dict[str, str]
+    recorded: RecordCopied
+    missing: tuple[str, ...]  # files that the source lacks, or has with other content
 
 
-def copy_record(source: Database, target: Database, run_id: str | None = None) -> Copied:
-    """Copy all chains of a site into an empty database, or one run into a site, in one transaction.
+@dataclass(slots=True)
+class _Rows:
+    """The rows that were copied, by table."""
 
-    Artefacts' files are not copied. Positions follow the order in which the events were written in the source.
+    number: dict[str, int] = field(default_factory=dict[str, int])
+
+    def add(self, table: Table, rows: int) -> None:
+        """Count rows of a table."""
+        self.number[table.name] = self.number.get(table.name, 0) + rows
+
+
+def copy_record(
+    source: Path,
+    target: Path,
+    *,
+    actor: Callable[[Path], str],
+    progress: Progress | None = None,
+    files: Files | None = None,
+) -> CopyReport:
+    """Copy all chains, files, accounts, keys and signatures of a data folder into one that has none.
+
+    The numbers and texts of every row, and so all hashes, are the same afterwards. Leases, sign-ins and who is in
+    control are of the moment and stay behind. The copy is recorded in the site's chain of the target, and signed.
+
+    Args:
+        source: the data folder to copy; it is only read. No run may be going on in it.
+        target: the data folder to copy to: new, empty but for a site.yaml, or with a prepared, empty database.
+        actor: gives the name of the person for the record, or raises; called with the source.
+        progress: a function that is called with the number of bytes of files copied.
+        files: durable file operations.
 
     Raises:
-        StoreError: the target has the run already, or any run where all are copied; nothing was written.
+        StoreError: the target has a record already, or one of the two cannot be used. Of the chains nothing was
+            copied; files that were are used when this is repeated.
     """
-    with source.reading() as reading, target.writing() as writing:
-        _require_room(writing, run_id)
-        defer_references(writing)
-        counted: dict[str, int] = {}
-        _copy_rows(reading, writing, runs, run_id, counted)
-        _copy_events(reading, writing, run_id, counted)
-        for table in _OF_RUNS[1:]:
-            _copy_rows(reading, writing, table, run_id, counted)
-        _copy_jobs(reading, writing, run_id, counted)
-        if run_id is None:
-            for table in _OF_THE_SITE:
-                _copy_rows(reading, writing, table, None, counted)
-        ends = select(heads.c.run_id, heads.c.sha256)
-        there = {row.run_id: row.sha256 for row in reading.execute(ends) if run_id in (None, row.run_id)}
-        here = {row.run_id: row.sha256 for row in writing.execute(ends) if row.run_id in there}
-        if there != here or not there:
-            raise StoreError("the copy's chains do not end as the source's do; nothing was copied")
-    return Copied(counted, here)
+    files = files or DurableFiles()
+    who = actor(source)
+    _require_new(target)
+    origin = open_read_only(source, files)
+    try:
+        with origin.reading() as reading, Store.open(target, files=files) as store:
+            _require_no_record(store)
+            missing, copied = _copy_files(reading, source, store, progress)
+            with store.database.writing() as writing:
+                number = _copy_rows(reading, writing)
+                ends = _require_equal_ends(reading, writing)
+            with folder_errors("keys and signatures could not be copied"):
+                _copy_keys(source, target, files)
+            recorded = RecordCopied(
+                source=str(source.resolve()),
+                database=store.database.where,
+                runs=number.get("runs", 0) - (SITE in ends),
+                events=number.get("events", 0),
+                files=copied,
+                heads_sha256=sha256_text(canonical(ends)),
+            )
+    finally:
+        origin.close()
+    with Store.open(target, files=files, create=False) as store:  # with the keys that are there now
+        store.record_site([recorded], actor=who)
+        checkpoint(store, SITE)
+    return CopyReport(recorded, tuple(missing))
 
 
-def _require_room(connection: Connection, run_id: str | None) -> None:
-    known = set(connection.execute(select(runs.c.run_id)).scalars())
-    taken = known if run_id is None else known & {run_id}
-    if taken:
+def _require_new(target: Path) -> None:
+    there = [name for name in (KEYS, LOG_NAME) if (target / name).exists()]
+    if there:
         raise StoreError(
-            f"the target has {min(taken)} already",
-            remedy="A whole site is copied into an empty database; name one run to copy it into a site with others",
+            f"the target has {' and '.join(there)} already",
+            where=str(target),
+            remedy="Name a new folder, or one that has nothing but a site.yaml",
         )
 
 
-def _chosen(table: Table, run_id: str | None) -> Any:
-    statement = select(table)
-    return statement if run_id is None else statement.where(table.c.run_id == run_id)
+def _require_no_record(store: Store) -> None:
+    with store.database.reading() as connection:
+        known = connection.execute(select(runs.c.run_id).limit(1)).scalar()
+    if known is not None:
+        raise StoreError(
+            f"the target has a record already: {known}",
+            where=store.database.where,
+            remedy="Copy into an empty database; two records are never mixed",
+        )
+
+
+def _copy_files(reading: Connection, source: Path, store: Store, progress: Progress | None) -> tuple[list[str], int]:
+    """Copy all files that the record refers to; return what the source lacks, and how many were copied."""
+    origin = ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds())
+    named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
+    sizes = {row.sha256: int(row.size_bytes) for row in reading.execute(named)}
+    missing: list[str] = []
+    done = 0
+    for sha256, size in sizes.items():
+        path = origin.folder / relative_path(sha256)
+        if not path.is_file():
+            missing.append(f"{path}: missing in the source")
+        else:
+            try:
+                store.put_file(path, kind="copy", media_type="application/octet-stream", sha256=sha256)
+            except StoreError as error:
+                if "changed in transfer" not in error.what:
+                    raise
+                missing.append(f"{path}: altered in the source")
+        done += size
+        if progress is not None:
+            progress("copying files", done, sum(sizes.values()))
+    return missing, len(sizes) - len(missing)
+
+
+def _copy_keys(source: Path, target: Path, files: Files) -> None:
+    if (source / LOG_NAME).is_file():
+        files.write(target / LOG_NAME, chunks_of(source / LOG_NAME))
+        files.sync_file(target / LOG_NAME)
+    if (source / KEYS).is_dir():
+        files.make_directory(target / KEYS, private=True)
+        for key in sorted(path for path in (source / KEYS).iterdir() if path.is_file()):
+            files.write(target / KEYS / key.name, [key.read_bytes()], private=True)
+            files.sync_file(target / KEYS / key.name)
+        files.sync_directory(target / KEYS)
+    files.sync_directory(target)
+
+
+def _copy_rows(reading: Connection, writing: Connection) -> dict[str, int]:
+    """Copy all rows of the record; returns their number by table. The index of events is derived again."""
+    defer_references(writing)
+    counted = _Rows()
+    _copy_table(reading, writing, runs, counted)
+    place = (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
+    for chunk in _chunks(reading, select(events).join(event_index, place).order_by(event_index.c.position)):
+        writing.execute(insert(events), chunk)
+        index_events(writing, [_to_index(row) for row in chunk])
+        counted.add(events, len(chunk))
+    for table in _TABLES:
+        _copy_table(reading, writing, table, counted)
+    _copy_table(reading, writing, jobs, counted)
+    return counted.number
+
+
+def _to_index(row: dict[str, Any]) -> EventToIndex:
+    return EventToIndex(row["run_id"], row["seq"], row["kind"], row["actor"], plain_payload(row["payload"]))
+
+
+def _copy_table(reading: Connection, writing: Connection, table: Table, counted: _Rows) -> None:
+    order = [table.c.at_utc] if table is checkpoints else []  # the order in which they were made
+    for chunk in _chunks(reading, select(table).order_by(*order, *table.primary_key.columns)):
+        writing.execute(insert(table), chunk)
+        counted.add(table, len(chunk))
 
 
 def _chunks(connection: Connection, statement: Any) -> Iterator[Sequence[dict[str, Any]]]:
@@ -88,37 +205,14 @@ def _chunks(connection: Connection, statement: Any) -> Iterator[Sequence[dict[st
         yield [dict(row) for row in chunk]
 
 
-def _copy_rows(
-    reading: Connection, writing: Connection, table: Table, run_id: str | None, counted: dict[str, int]
-) -> None:
-    statement = _chosen(table, run_id)
-    order = [table.c.at_utc] if table is checkpoints else []
-    for chunk in _chunks(reading, statement.order_by(*order, *table.primary_key.columns)):
-        writing.execute(insert(table), chunk)
-        counted[table.name] = counted.get(table.name, 0) + len(chunk)
-
-
-def _copy_events(reading: Connection, writing: Connection, run_id: str | None, counted: dict[str, int]) -> None:
-    place = (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
-    written = _chosen(events, run_id).join(event_index, place).order_by(event_index.c.position)
-    for chunk in _chunks(reading, written):
-        writing.execute(insert(events), chunk)
-        index_events(
-            writing,
-            [
-                EventToIndex(row["run_id"], row["seq"], row["kind"], row["actor"], plain_payload(row["payload"]))
-                for row in chunk
-            ],
+def _require_equal_ends(reading: Connection, writing: Connection) -> dict[str, str]:
+    """Return the last hash of each chain. Raises StoreError unless they and the number of events are equal."""
+    ends = select(heads.c.run_id, heads.c.sha256).order_by(heads.c.run_id)
+    number = select(func.count()).select_from(events)
+    there, here = ({str(run): str(sha256) for run, sha256 in c.execute(ends)} for c in (reading, writing))
+    if there != here or reading.execute(number).scalar_one() != writing.execute(number).scalar_one():
+        raise StoreError(
+            "the chains of the copy do not end as those of the source; nothing of them was copied",
+            remedy="Run `orthocapture audit verify all` on the source",
         )
-        counted["events"] = counted.get("events", 0) + len(chunk)
-
-
-def _copy_jobs(reading: Connection, writing: Connection, run_id: str | None, counted: dict[str, int]) -> None:
-    """Copy jobs behind those that are there, queued again where a worker has them in the source."""
-    last = writing.execute(select(func.coalesce(func.max(jobs.c.position), 0))).scalar_one()
-    for chunk in _chunks(reading, _chosen(jobs, run_id).order_by(jobs.c.position)):
-        for row in chunk:
-            last += 1
-            row["position"] = last
-        writing.execute(insert(jobs), chunk)
-        counted["jobs"] = counted.get("jobs", 0) + len(chunk)
+    return here

@@ -27,6 +27,8 @@ def lease_now_s(connection: Connection, clock: Clock) -> float:
 class Database(ABC):
     """Connections to one database, with two kinds of transaction. All methods raise StoreError."""
 
+    where: str  # what errors and records call it: a path, or an address without its password
+
     @abstractmethod
     def reading(self) -> AbstractContextManager[Connection]:
         """Begin a read transaction: one consistent snapshot."""

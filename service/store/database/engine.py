@@ -101,6 +101,7 @@ class SqliteDatabase(Database):
         self._copy = copy  # the folder of a copy that goes with this object
         self._patience_s = patience_s
         self._path = path
+        self.where = str(path)
         self._files = files
         self._journal = journal
         self._opened: dict[Path, tuple[int, int]] = {}  # device and inode of the files written to

@@ -8,7 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from sqlalchemy import Connection, ForeignKeyConstraint, PrimaryKeyConstraint, UniqueConstraint, text
+from sqlalchemy import (
+    Connection,
+    ForeignKeyConstraint,
+    PrimaryKeyConstraint,
+    UniqueConstraint,
+    text,
+)
+from sqlalchemy.sql.schema import ColumnCollectionConstraint
 
 from service.store.database import postgres_schema
 from service.store.database.tables import metadata
@@ -68,19 +75,19 @@ def schema_faults(connection: Connection) -> Iterator[Fault]:
 
 def _expected_columns() -> dict[tuple[str, str], object]:
     kinds = {"Integer": "bigint", "Text": "text", "REAL": "double precision"}
-    of_metadata = {
+    of_metadata: dict[tuple[str, str], object] = {
         (table.name, column.name): (kinds[type(column.type).__name__], not column.nullable)
         for table in metadata.tables.values()
         for column in table.columns
     }
-    return of_metadata | postgres_schema.FURTHER_COLUMNS
+    return of_metadata | dict(postgres_schema.FURTHER_COLUMNS)
 
 
 def _expected_constraints() -> set[tuple[str, str]]:
     found: set[tuple[str, str]] = set(postgres_schema.FURTHER_CONSTRAINTS)
     for table in metadata.tables.values():
         for one in table.constraints:
-            columns = "_".join(column.name for column in one.columns) if hasattr(one, "columns") else ""
+            columns = "_".join(c.name for c in one.columns) if isinstance(one, ColumnCollectionConstraint) else ""
             made: dict[type, str] = {
                 PrimaryKeyConstraint: f"{table.name}_pkey",
                 ForeignKeyConstraint: f"{table.name}_{columns}_fkey",

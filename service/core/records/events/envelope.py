@@ -51,6 +51,7 @@ from service.core.records.events.site import (
     KeyChanged,
     LeftoversRemoved,
     ProtocolApproved,
+    RecordCopied,
     RecordRebuilt,
     RunSigned,
     ServiceStarted,
@@ -106,7 +107,8 @@ Payload = Annotated[
     | ActionAfterEnd
     | ProtocolApproved
     | DataRestored
-    | RecordRebuilt,
+    | RecordRebuilt
+    | RecordCopied,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

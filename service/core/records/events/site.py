@@ -139,6 +139,18 @@ class DataRestored(Record):
     host: str
 
 
+class RecordCopied(Record):
+    """This record was copied from another database or folder; it goes on here, and no longer there."""
+
+    kind: Literal["record_copied"] = "record_copied"
+    source: str  # the data folder it was copied from
+    database: str  # the database it was copied into, without its password
+    runs: int  # runs, without the site's own chain
+    events: int  # events of all chains
+    files: int
+    heads_sha256: str  # of the canonical JSON of {chain: SHA-256 of its last event}, the same in both
+
+
 class RecordRebuilt(Record):
     """Database or journal was overwritten, cut or lost, and was made again from the other; the old files remain."""
 
