@@ -11,12 +11,14 @@ from pathlib import Path
 import psycopg
 import pytest
 from sqlalchemy import select, text
+from typer.testing import CliRunner
 
 from service.audit.filters import EventFilter
 from service.audit.record.rows import runs as listed_runs
 from service.audit.record.search import events_page
+from service.cli.main import app
 from service.core.errors import ComputeError, StoreError
-from service.core.records.events import StepNote
+from service.core.records.events import RecordCopied, StepNote
 from service.store.database.postgres_schema import EVIDENCE
 from service.store.database.tables import artefacts, event_facets, events, jobs, metadata
 from service.store.durable_effects import Clock
@@ -98,7 +100,8 @@ def test_the_programs_role_changes_no_evidence(cluster: Cluster, tmp_path: Path)
     database = cluster.new_database()
     fill(cluster.site(tmp_path / "site", database))
     for table in EVIDENCE:
-        column = cluster.run(database, f"SELECT attname FROM pg_attribute WHERE attrelid = '{table}'::regclass")[0][0]
+        named = f"SELECT attname FROM pg_attribute WHERE attrelid = '{table}'::regclass AND attnum = 1"
+        column = cluster.run(database, named)[0][0]
         for statement in (
             f"UPDATE {table} SET {column} = {column}",
             f"DELETE FROM {table}",
@@ -182,7 +185,7 @@ TAMPERED = {
     "a trigger switched off": ("ALTER TABLE events DISABLE TRIGGER events_append_only", "the trigger"),
     "a trigger dropped": ("DROP TRIGGER artefacts_no_truncate ON artefacts", "is missing: the evidence could be"),
     "a refusal that refuses nothing": (
-        "CREATE OR REPLACE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS $$BEGIN RETURN OLD; END$$",
+        "CREATE OR REPLACE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS $$BEGIN RETURN OLD;END$$",
         "is not the one that this software makes",
     ),
     "a grant": (
@@ -226,7 +229,7 @@ def test_what_a_superuser_did_is_found(cluster: Cluster, tmp_path: Path, done: s
 WRITER = """
 import sys
 from pathlib import Path
-from service.core.records.events import StepNote
+from service.core.records.events import RecordCopied, StepNote
 from service.store.store import Store
 with Store.open(Path(sys.argv[1]), create=False) as store:
     for n in range(int(sys.argv[3])):
@@ -347,3 +350,91 @@ def test_the_tables_are_those_of_the_metadata(cluster: Cluster) -> None:
     made = {row[0] for row in cluster.run(database, "SELECT tablename FROM pg_tables WHERE schemaname = 'public'")}
     assert made == {*metadata.tables, "alembic_version", "event_words"}
     assert jobs.name in made
+
+
+def copied(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["store", "copy", *map(str, arguments), "--operator", "Ada"])
+    return result.exit_code, result.output
+
+
+def rows_of(folder: Path) -> dict[str, list[tuple[object, ...]]]:
+    """Every row of the record, but for what the copy added to the site's chain and its place in the queue."""
+    with Store.open(folder) as store, store.database.reading() as connection:
+        return {
+            name: [
+                tuple(row)
+                for row in connection.execute(select(table).order_by(*table.primary_key.columns))
+                if SITE not in tuple(row)
+            ]
+            for name, table in metadata.tables.items()
+            if name not in ("event_index", "leases", "sessions", "control")
+        }
+
+
+def test_a_record_goes_to_postgresql_and_back_with_every_number_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    run_id = fill(tmp_path / "lite")
+    site, back = cluster.site(tmp_path / "site"), tmp_path / "back"
+    for source, target in ((tmp_path / "lite", site), (site, back)):
+        status, said = copied(source, target)
+        assert (status, "Copied: 1 run, " in said) == (0, True), said
+        report = verify(target)
+        assert report.ok, report.faults
+        assert report.heads[run_id] == verify(tmp_path / "lite").heads[run_id]
+    assert rows_of(tmp_path / "lite") == rows_of(site) == rows_of(back)
+    with Store.open(back) as store:
+        copies = [e.payload for e in store.events(SITE) if isinstance(e.payload, RecordCopied)]
+        assert [copy.runs for copy in copies] == [1, 1]
+        assert "postgresql" in copies[0].database
+        store.record(run_id, [StepNote(step="s", attempt=1, note="goes on")], actor="Ada")
+        checkpoint(store, run_id)
+    assert verify(back).ok
+
+
+def test_two_records_are_never_mixed(cluster: Cluster, tmp_path: Path) -> None:
+    fill(tmp_path / "lite")
+    database = cluster.new_database()
+    status, said = copied(tmp_path / "lite", cluster.site(tmp_path / "site", database))
+    assert status == 0, said
+    for target, why in (
+        (tmp_path / "site", "has keys and signatures.jsonl already"),
+        (cluster.site(tmp_path / "other", database), "has a record already"),
+        (tmp_path / "lite", "has keys and signatures.jsonl already"),
+    ):
+        before = verify(tmp_path / "site").heads
+        status, said = copied(tmp_path / "lite", target)
+        assert status == 1
+        assert why in " ".join(said.split())
+        assert verify(tmp_path / "site").heads == before
+
+
+def test_a_file_that_the_source_lost_is_told_and_the_rest_is_copied(cluster: Cluster, tmp_path: Path) -> None:
+    run_id = fill(tmp_path / "lite")
+    with Store.open(tmp_path / "lite") as store:
+        lost = next(row.ref.sha256 for row in store.artefacts(run_id) if row.ref.kind == "image")
+        store.artefact_path(lost).unlink()
+    status, said = copied(tmp_path / "lite", cluster.site(tmp_path / "site"))
+    assert status == 1
+    assert "missing in the source" in " ".join(said.split())
+    assert [lost in str(fault) for fault in verify(tmp_path / "site").faults] == [True]
+
+
+def test_a_database_is_prepared_by_its_owner_with_one_command(cluster: Cluster, tmp_path: Path) -> None:
+    database = cluster.new_database(prepared=False)
+    command = ["store", "prepare", cluster.url(database, OWNER), "--role", ROLE]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    run_id = fill(cluster.site(tmp_path / "site", database))
+    said = CliRunner().invoke(app, ["audit", "verify", "all", "--data", str(tmp_path / "site"), "--json"])
+    assert (said.exit_code, run_id in said.output) == (0, True)
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 1
+    assert "prepared already" in " ".join(again.output.split())
+
+
+@pytest.mark.parametrize("command", [("backup", "copy"), ("rebuild",)])
+def test_what_is_sqlites_alone_is_refused_by_name(site: Path, tmp_path: Path, command: tuple[str, ...]) -> None:
+    fill(site)
+    arguments = [command[0], *(str(tmp_path / name) for name in command[1:])]
+    result = CliRunner().invoke(app, ["store", *arguments, "--data", str(site), "--operator", "Ada"][:-2])
+    assert result.exit_code == 1
+    assert "the record of this site is in PostgreSQL" in " ".join(result.output.split())

@@ -207,6 +207,12 @@ def prepare(owner_url: str, role: str) -> None:
     where = engine.url.render_as_string(hide_password=True)
     try:
         with _store_errors(where), engine.begin() as connection:
+            if connection.execute(text("SELECT to_regclass('alembic_version') IS NOT NULL")).scalar_one():
+                raise StoreError(
+                    "this database was prepared already",
+                    where=where,
+                    remedy="Use it, or prepare another; nothing was changed",
+                )
             postgres_schema.make(connection, role)
     finally:
         engine.dispose()

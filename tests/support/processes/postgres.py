@@ -11,6 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import psutil
 import psycopg
 
 from service.store.database.postgres import prepare
@@ -52,8 +53,11 @@ class Cluster:
         self._run("pg_ctl", "-w", "-m", "immediate", "-D", str(self._data), "stop")
 
     def kill(self) -> None:
-        """Kill the server's first process; the others end with it."""
-        os.kill(int((self._data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL)
+        """Kill the server's first process and wait until the others have ended with it."""
+        first = psutil.Process(int((self._data / "postmaster.pid").read_text().split()[0]))
+        others = first.children(recursive=True)
+        os.kill(first.pid, signal.SIGKILL)
+        psutil.wait_procs([first, *others])
 
     def url(self, database: str, role: str) -> str:
         """The address of a database for a role."""
