@@ -334,6 +334,18 @@ RUN_ELSEWHERE = {
         "tests/recording/test_doctor_records.py::test_a_whole_rig_is_the_same_on_its_replay"
     ),
     "orthocapture simulate kuka": "tests/kuka/test_kuka_driver.py::test_a_day_without_trouble",
+    '.venv/bin/python -m pip install ".[site]"': (
+        "tests/store/test_postgres.py::test_the_tables_are_those_of_the_metadata"
+    ),
+    "orthocapture store prepare postgresql://orthocapture_owner@db.example/orthocapture --role orthocapture": (
+        "tests/store/test_postgres.py::test_a_database_is_prepared_by_its_owner_with_one_command"
+    ),
+    "orthocapture store copy runs site-folder": (
+        "tests/store/test_postgres.py::test_a_record_goes_to_postgresql_and_back_with_every_number_the_same"
+    ),
+    "orthocapture store copy site-folder archive": (
+        "tests/store/test_postgres.py::test_a_record_goes_to_postgresql_and_back_with_every_number_the_same"
+    ),
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),
