@@ -250,14 +250,17 @@ class Link:
         return self.call("Listing the settings", lambda camera: frozenset(str(n) for n, _ in camera.list_config()))
 
     def _widget(self, camera: Gphoto, name: str) -> Gphoto:
+        """Read a setting. Of a Canon that lacks one, libgphoto2 answers with nothing instead of an error."""
+        missing = DeviceRefusedError(f"the camera has no setting {name}", where=self.where, remedy=NOT_STATED)
         try:
-            return camera.get_single_config(name)
+            widget = camera.get_single_config(name)
         except gp.GPhoto2Error as error:
             if int(error.code) != gp.GP_ERROR_BAD_PARAMETERS:
                 raise
-            raise DeviceRefusedError(
-                f"the camera has no setting {name}", where=self.where, remedy=NOT_STATED
-            ) from error
+            raise missing from error
+        if widget is None:
+            raise missing
+        return widget
 
     def value(self, name: str) -> str:
         """Return the value of one widget. Raises DeviceRefusedError if the camera has or states none."""

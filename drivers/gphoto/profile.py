@@ -132,10 +132,10 @@ def choose_number(widget: Widget, wanted: float, offered: Sequence[str], where: 
     numbers.sort(key=lambda pair: abs(pair[1] - wanted))
     word, number = numbers[0]
     if abs(number - wanted) > RELATIVE_TOLERANCE * wanted:
-        near = ", ".join(neighbour for neighbour, _ in numbers[:4])
-        raise DeviceRefusedError(
-            f"the camera does not offer {name} {wanted:g}", where=where, remedy=f"Nearest that it offers: {near}"
-        )
+        near = f"Nearest that it offers: {', '.join(neighbour for neighbour, _ in numbers[:4])}"
+        if len(numbers) == 1:  # as a Canon that chooses the value itself
+            near = f"It offers only {word}. {widget.if_fixed or 'Turn the mode dial to M'}"
+        raise DeviceRefusedError(f"the camera does not offer {name} {wanted:g}", where=where, remedy=near)
     return word
 
 

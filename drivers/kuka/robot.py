@@ -40,7 +40,7 @@ from drivers.kuka import KukaConfig
 from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
 from drivers.kuka.speeds import Speeds
-from drivers.kuka.wire import JOINTS, State, agree, flange_words, to_abc
+from drivers.kuka.wire import JOINTS, Hello, State, agree, flange_words, to_abc
 from service.core.arms.model import ArmModel, flange_pose, known_arms
 from service.core.arms.seven_axes import nearest_posture
 from service.core.geometry import to_rotation_vector
@@ -62,6 +62,7 @@ class KukaRobot:
         self._where = f"{config.host}:{config.port}"
         self._latch = Latch(self._where)
         self._link: Link | None = None
+        self._refused: Hello | None = None  # the greeting of an arm of a model that is not known
         self._stream: PoseStream | None = None
         self._arm: ArmModel | None = None  # as the application states it
         self._arrived: deque[RobotSample] = deque()  # from the link's thread to the stream's
@@ -85,12 +86,14 @@ class KukaRobot:
         an application without FRI if the configuration asks for it.
         """
         self.close()
+        self._refused = None
         self._arrived.clear()
         self._speeds = Speeds()
         address = (self._config.host, self._config.port)
         self._link = link = Link(address, self._config.connect_timeout_s, self._receive)
         known = {arm.name: arm for arm in known_arms() if arm.family == "seven_axes"}
         if link.hello.model not in known:
+            self._refused = link.hello  # a recording has the greeting of this arm as well
             self.close()
             remedy = f"Known are {', '.join(known)}"
             raise DeviceFaultError(f"the arm is a {link.hello.model!r}", where=self._where, remedy=remedy)
@@ -190,12 +193,18 @@ class KukaRobot:
         ]
 
     def answers(self) -> DeviceAnswers:
-        """Return what the application greeted with, and the newest line of its stream."""
+        """Return what the application greeted with, and the newest line of its stream.
+
+        Of an arm that `open` refused for its model that is the greeting alone: how far its joints go is not known.
+        """
+        if self._link is None and self._refused is not None:
+            return DeviceAnswers(
+                exchanges=(_greeting(self._refused),), silent=("the stream: the model of the arm is not known",)
+            )
         link, state = self._linked(), self._newest()
-        greeting = json.dumps(dataclasses.asdict(link.hello))
-        now = f"mode {state.mode}, safety {state.safety.value}, ready {state.ready}, locked {state.locked}"
+        now = f"mode {state.mode}, safety {state.safety_word}, ready {state.ready}, locked {state.locked}"
         return DeviceAnswers(
-            exchanges=(Exchange(question="greeting", answer=greeting), Exchange(question="state", answer=now)),
+            exchanges=(_greeting(link.hello), Exchange(question="state", answer=now)),
             samples=(
                 Sample(
                     source="stream",
@@ -418,3 +427,7 @@ class KukaRobot:
                 remedy="Choose another viewpoint",
             )
         return [float(v) for v in joints]
+
+
+def _greeting(hello: Hello) -> Exchange:
+    return Exchange(question="greeting", answer=json.dumps(dataclasses.asdict(hello)))

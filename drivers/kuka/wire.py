@@ -53,6 +53,7 @@ class State:
     T_base_flange: Transform
     mode: str
     safety: SafetyState
+    safety_word: str  # the wire's own: two of its words are one state
     ready: bool
     locked: bool
     motion: int  # 0: none
@@ -90,6 +91,7 @@ def state_of(line: Line) -> State:
         T_base_flange=from_abc(_numbers(line, "flange_xyz_m", 3), _numbers(line, "flange_abc_rad", 3)),
         mode=_text(line, "mode"),
         safety=_SAFETY.get(safety, SafetyState.UNKNOWN),
+        safety_word=safety,
         ready=_flag(line, "ready"),
         locked=_flag(line, "locked"),
         motion=whole(line, "motion"),

@@ -61,6 +61,7 @@ FILES = "what names a patient or a person in the headers of files"
 _KEPT_TEXTS = {"Sony": {"d040", "d07b", "d1ca"}, "Nikon": {"d0e3"}, "Canon": {"d1d8"}}
 _PROGRAM = re.compile(r"(?:Loaded program: |true |false |[A-Z]+ )?(?P<name>.+)$")
 _NO_PROGRAM = ("<unnamed>", "No program loaded")
+_SERIAL_FIELD = re.compile(r'"serial": "(?P<serial>[^"]+)"')
 _VERSION_WITH_NAME = re.compile(r"VER:[^:]*:(?P<name>[^\]]+)")
 
 
@@ -112,6 +113,8 @@ def _find_secrets(recording: Recording) -> Iterator[tuple[str, str]]:
 def _find_in_answer(question: str, answer: str) -> Iterator[tuple[str, str]]:
     if "serial" in question:
         yield answer, "serial number"
+    elif question == "greeting":  # of a KUKA, which has no report if it was refused for its model
+        yield from ((found["serial"], "serial number") for found in _SERIAL_FIELD.finditer(answer))
     elif question.startswith("*idn"):
         yield from ((part.strip(), "serial number") for part in answer.split(",")[2:3])
     elif "program" in question and (found := _PROGRAM.match(answer)) and found["name"] not in _NO_PROGRAM:

@@ -9,6 +9,9 @@ from simulators.still_camera.body import CameraFile
 
 END = struct.pack("<II", 8, 0)  # closes each answer
 _ENUMERATION = 3
+_BUTTON = 0x0001  # bit of what a record of changes tells
+_PRESSED = 4  # the button's state once an EOS M has taken the release
+_VERSION_OF_CHANGES, _SOME_VERSION = 0xD199, 0x0F  # libgphoto2 reads such records only after their version
 
 
 class Event(IntEnum):
@@ -17,6 +20,7 @@ class Event(IntEnum):
     VALUE = 0xC189
     CHOICES = 0xC18A
     STATUS = 0xC18B
+    CHANGES = 0xC1A5
     OBJECT_ADDED = 0xC1A7
     TRANSFER_WANTED = 0xC1A9
 
@@ -40,6 +44,12 @@ def choices(code: int, count: int, data: bytes) -> bytes:
 def status(*, busy: bool) -> bytes:
     """The camera has begun or ended an exposure."""
     return record(Event.STATUS, struct.pack("<I", int(busy)))
+
+
+def pressed() -> bytes:
+    """An EOS M has taken the release: without this record libgphoto2 takes it for refused."""
+    changes = struct.pack("<IHHHH", 12, _BUTTON, 0, _PRESSED, 0)
+    return value(_VERSION_OF_CHANGES, struct.pack("<I", _SOME_VERSION)) + record(Event.CHANGES, changes)
 
 
 def object_added(handle: int, storage: int, parent: int, file: CameraFile) -> bytes:

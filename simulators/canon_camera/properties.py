@@ -37,7 +37,7 @@ class Code(IntEnum):
 
 CARD, MEMORY = 2, 4  # destinations of files
 MANUAL_FOCUS, ONE_SHOT = 3, 0
-MANUAL_EXPOSURE, APERTURE_PRIORITY = 3, 2
+MANUAL_EXPOSURE, APERTURE_PRIORITY, BULB = 3, 2, 4
 _BATTERY = ((87, 2), (62, 4), (37, 1), (12, 5))  # at least so many per cent: code
 _NEARLY_EMPTY = 0
 _PER_STOP = 8  # steps of the codes of exposure times; f-numbers have twice as many for a factor of two
@@ -211,7 +211,7 @@ class Properties:
         formats = self._entries.get(Code.IMAGE_FORMAT)
         kinds = formats.value.parts if isinstance(formats, Formats) else FORMATS[0].parts
         jpeg = next((part for part in kinds if part[0] == JPEG), None)
-        stated = aperture in _APERTURE_CODES  # otherwise there is no lens that states one
+        stated = aperture in _APERTURE_CODES  # otherwise the body chooses it, or there is no lens that states one
         f_number = 2.0 ** ((aperture - _F_1) / (2 * _PER_STOP)) if stated else 8.0
         return ExposureSettings(
             aperture_f=APERTURE_F.get(aperture, f_number),
@@ -222,7 +222,7 @@ class Properties:
             raw=any(part[0] == RAW_FILE for part in kinds),
             jpeg_level=3 if jpeg == JPEG_LARGE_NORMAL else 1,
             on_card=self.value(Code.DESTINATION) != MEMORY,
-            states_aperture=stated,
+            states_aperture=stated or self.value(Code.EXPOSURE_MODE) not in (MANUAL_EXPOSURE, BULB),
         )
 
 

@@ -2,12 +2,17 @@
 
 A recording names each property by its EOS code, with the numbers that libgphoto2 read from the body's events. They
 go back into events in the same way: numbers as four bytes, image formats as structures, texts with a closing zero.
+
+`recordings` holds what is public of real bodies, one file each, with its source; bench/cameras/canon_listings.py
+wrote them from logs of events, or from listings of settings in words.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +22,7 @@ from simulators.serve import SimulatorError
 
 MODEL, FIRMWARE, LENS, SERIAL = "Canon EOS R5", "3-1.8.2", "RF24-70mm F2.8 L IS USM", "042021006092"
 _MAKER = "Canon"
+_FOLDER = Path(str(resources.files("simulators.canon_camera"))) / "recordings"
 _EVENTS = range(0xD001, 0xD200)  # codes of which a body tells in events
 _STRUCTURES = {*range(0xD180, 0xD193), 0xD1A0, 0xD1D3}  # custom functions and the state of the focus points
 _SERIAL, _LENS = 0xD1AF, 0xD1D8
@@ -65,6 +71,17 @@ class Table:
     def serial(self) -> str:
         """The serial number."""
         return self.text(_SERIAL, SERIAL)
+
+
+@cache
+def names() -> tuple[str, ...]:
+    """The recorded bodies."""
+    return tuple(sorted(file.stem for file in _FOLDER.glob("*.json")))
+
+
+def recording_of(name: str) -> Path:
+    """The file of a recorded body."""
+    return _FOLDER / f"{name}.json"
 
 
 def replayed_table(file: Path, name: str = "") -> Table:

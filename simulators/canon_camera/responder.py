@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from simulators.canon_camera.body import FORMAT_CR3, CanonBody
-from simulators.canon_camera.events import Event
+from simulators.canon_camera.events import Event, pressed
 from simulators.canon_camera.properties import MEMORY, Code
 from simulators.faults import FaultPlan
 from simulators.ptpip import codec
@@ -22,7 +22,7 @@ from simulators.still_camera.operations import Operation, Operations, accept
 
 VENDOR = 0x0B
 _ASSOCIATION = 0x3001
-_HALF, _FULL = 1, 2
+_HALF, _FULL, _BOTH = 1, 2, 3  # what of the release button is pressed; libgphoto2 presses an EOS M at once
 _VIEWFINDER_TO_COMPUTER = 2
 _NOT_READY = 0xA102
 _JPEG_PART = 1
@@ -67,7 +67,7 @@ class CanonResponder(Operations):
     def message(self, name: str, request: codec.Request, data: bytes) -> str:
         """The name of a message in fault plans: a full press is `shutter`, as with other cameras."""
         del data
-        return "shutter" if name == "press" and request.parameters[:1] == (_FULL,) else name
+        return "shutter" if name == "press" and request.parameters[:1] in ((_FULL,), (_BOTH,)) else name
 
     # --- identity and card ---
 
@@ -161,7 +161,9 @@ class CanonResponder(Operations):
         del data
         if not self._remote:
             return Reply(SESSION_NOT_OPEN)
-        if request.parameters[:1] == (_FULL,):
+        if request.parameters[:1] in ((_FULL,), (_BOTH,)):
+            if request.parameters[:1] == (_BOTH,):
+                self._body.properties.announce(pressed())  # libgphoto2 drops what comes before it
             self._body.shoot()
         elif request.parameters[:1] != (_HALF,):
             return Reply(INVALID_PARAMETER)
@@ -169,7 +171,8 @@ class CanonResponder(Operations):
 
     def _let_go(self, request: codec.Request, data: bytes) -> Reply:
         del data
-        return Reply() if request.parameters[:1] in ((_HALF,), (_FULL,)) else Reply(INVALID_PARAMETER)
+        known = request.parameters[:1] in ((_HALF,), (_FULL,), (_BOTH,))
+        return Reply() if known else Reply(INVALID_PARAMETER)
 
     def _drive_lens(self, request: codec.Request, data: bytes) -> Reply:
         # A body drives its lens only while live view goes to the computer.

@@ -15,7 +15,7 @@ from simulators.recordings import TAKEN_OUT, RecordedDevice
 from simulators.serve import SimulatorError
 
 _STATE = re.compile(r"mode (?P<mode>.*), safety (?P<safety>\w+), ready (?P<ready>\w+), locked (?P<locked>\w+)")
-_TAKEN_FOR = {"safeguard_stop": "external_stop"}  # recordings have one word for two of the wire's
+_TAKEN_FOR = {"safeguard_stop": "external_stop"}  # older recordings have one word for two of the wire's
 _APART_RAD = 1e-3  # of a resting arm's measured joints from the commanded ones
 _SERVED = ("time_s", "joints_rad", "commanded_rad", "override")
 

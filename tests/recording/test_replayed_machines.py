@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
+from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 import pytest
 import serial
@@ -223,20 +225,18 @@ def timeless(device: RecordedDevice) -> RecordedDevice:
 
 
 @pytest.mark.parametrize(
-    ("options", "orders", "named"),
+    ("options", "orders"),
     [
-        (("--mode", "T1", "--initial-joints=0.1,0.4,-0.2,-1.1,0.3,1.2,-0.5"), ("override 40",), ()),
-        (
-            ("--model", "LBR iiwa 14"),
-            ("stop external_stop",),
-            ("state, safety safeguard_stop: the wire's own word was not recorded; served as external_stop",),
-        ),
-        ((), ("stop protective_stop",), ()),
+        (("--mode", "T1", "--initial-joints=0.1,0.4,-0.2,-1.1,0.3,1.2,-0.5"), ("override 40",)),
+        (("--model", "LBR iiwa 14"), ("stop external_stop",)),
+        ((), ("stop enabling_switch",)),
+        ((), ("stop protective_stop",)),
     ],
 )
 def test_a_kuka_is_the_same_on_the_replay_of_its_recording(
-    tmp_path: Path, options: tuple[str, ...], orders: tuple[str, ...], named: tuple[str, ...]
+    tmp_path: Path, options: tuple[str, ...], orders: tuple[str, ...]
 ) -> None:
+    """The wire's own word is recorded: `external_stop` and `enabling_switch` are one state to a client."""
     with simulated_kuka(address(65), *options) as ready:
         for order in orders:
             pendant(ready["host"], order)
@@ -245,7 +245,50 @@ def test_a_kuka_is_the_same_on_the_replay_of_its_recording(
         again = recorded(tmp_path / "again.json", "arm", arm_section(ready["host"]))
     assert timeless(again) == timeless(first)
     assert again.answers.samples[0].fields["time_s"] > first.answers.samples[0].fields["time_s"]
-    assert ready["not_served"] == ["greeting, serial number: (serial number 1)", *named]
+    assert ready["not_served"] == ["greeting, serial number: (serial number 1)"]
+    safety = orders[0].removeprefix("stop ") if orders[0].startswith("stop ") else "normal"
+    assert f"safety {safety}," in by_question(again)["state"]
+
+
+def test_a_kuka_of_a_model_that_is_not_known_is_recorded_with_its_greeting(tmp_path: Path) -> None:
+    hello = {
+        "is": "hello",
+        "protocol": 1,
+        "model": "LBR iiwa 7 R800",
+        "serial": "4711",
+        "software": "Sunrise.OS 1.16",
+    }
+
+    class Application(StreamRequestHandler):
+        def handle(self) -> None:
+            self.wfile.write(json.dumps(hello).encode() + b"\n")
+            self.rfile.read()  # until the client goes
+
+    with ThreadingTCPServer((address(65), 0), Application) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        host, port = server.server_address[:2]
+        section = {**arm_section(str(host)), "port": port, "answer_timeout_s": 1.0}
+        said = recorded(tmp_path / "iiwa7.json", "arm", section)
+        server.shutdown()
+    greeting = json.loads(by_question(said)["greeting"])
+    assert (greeting["model"], greeting["software"]) == ("LBR iiwa 7 R800", "Sunrise.OS 1.16")
+    assert "4711" not in (tmp_path / "iiwa7.json").read_text(encoding="utf-8")
+    assert "the arm is a 'LBR iiwa 7 R800'" in said.error
+    assert said.answers.silent == ("the stream: the model of the arm is not known",)
+
+
+def test_an_older_recording_has_one_word_for_two_safety_states(tmp_path: Path) -> None:
+    greeting = json.dumps({"model": "LBR Med 14", "serial": "77", "software": "Sunrise.OS Med 2.6"})
+    answers = {"greeting": greeting, "state": "mode AUT, safety safeguard_stop, ready True, locked True"}
+    exchanges = [{"question": question, "answer": answer} for question, answer in answers.items()]
+    device = RecordedDevice.model_validate(
+        {"kind": "robot", "driver": "kuka_sunrise", "answers": {"exchanges": exchanges}}
+    )
+    changed(tmp_path / "older.json", device, {})
+    with simulated_kuka(address(66), "--replay", str(tmp_path / "older.json")) as ready:
+        assert ready["not_served"] == [
+            "state, safety safeguard_stop: the wire's own word was not recorded; served as external_stop"
+        ]
 
 
 def test_another_kuka_says_what_was_recorded_of_it(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from drivers.gphoto.profile import Fixed, Profile, Widget
 PROFILE = Profile(
     bodies="Canon EOS",
     manufacturer="Canon",
-    model=r"Canon EOS .+",
+    model=r"Canon EOS[ -].+",  # "Canon EOS R5", "Canon EOS-1D X"
     exif_make="Canon",
     f_number=Widget("aperture"),
     shutter=Widget("shutterspeed"),

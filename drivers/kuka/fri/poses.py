@@ -151,6 +151,7 @@ class FriPoses:
             T_base_flange=self._pose_of(joints),
             mode=now.mode,
             safety=SafetyState.PROTECTIVE_STOP if stopped else now.safety,
+            safety_word=now.safety_word,
             ready=now.ready,
             locked=now.locked,
             motion=now.motion,
