@@ -214,9 +214,8 @@ class Walk:
         missing = {"redo", "lost", "control"} - self._done
         if missing:
             raise SystemExit(f"this walk had no {', '.join(sorted(missing))}")
-        self._say(
-            f"{self._mends + self._hands.mends.total()} times advice was followed; {self._taken} pictures in {self._into}"
-        )
+        followed = self._mends + self._hands.mends.total()
+        self._say(f"{followed} times advice was followed; {self._taken} pictures in {self._into}")
 
     def _once(self, moment: str, do: Callable[[str], None] | None = None) -> None:
         if moment not in self._shown:

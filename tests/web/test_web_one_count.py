@@ -111,19 +111,20 @@ COURSES: Sequence[tuple[Course, int, int]] = (
 )
 
 
-def _audit(shown: BrowsedRun) -> str:
-    """The audit's first page, once it is computed."""
+def _audit(shown: BrowsedRun, page_of_it: str = "") -> str:
+    """A page of the audit, once it is computed."""
     page = ""
 
     def complete() -> bool:
         nonlocal page
-        page = shown.browser.get(f"/audit/runs/{shown.run}").text
+        page = shown.browser.get(f"/audit/runs/{shown.run}{page_of_it}").text
         return "data-pending" not in page
 
-    until(complete, "the audit's first page", every_s=0.05)
+    until(complete, "the page of the audit", every_s=0.05)
     return words(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("course", "taken", "known"), COURSES, ids=[course.__name__[1:] for course, _, _ in COURSES])
 def test_every_place_counts_the_same(capturing: Capturing, course: Course, taken: int, known: int) -> None:
     course(capturing)
@@ -149,3 +150,10 @@ def test_a_stop_keeps_as_many_as_the_header_counts(capturing: Capturing, course:
         step = capturing.shown.words("")
     (taken, _) = re.findall(r"This step (\d+) of (\d+)", step)[0]
     assert f"The {taken} images are kept." in step
+
+
+def test_a_deviation_has_one_name_on_the_page_of_the_run_and_in_the_audit(capturing: Capturing) -> None:
+    _one_again(capturing)
+    shown = capturing.shown
+    assert "Deviations 1 View taken again v1_002: a hand was in it" in shown.words("")
+    assert "View taken again" in _audit(shown, "/deviations")

@@ -375,3 +375,17 @@ def test_photographs_of_the_layout_count_as_recorded() -> None:
     trouble = view_of(log).question.trouble
     assert trouble is not None
     assert trouble.safe == "Yes. 2 photographs are recorded, and every result so far."
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [
+        (1, None, "at least 1 coat"),
+        (2, None, "at least 2 coats"),
+        (0, 1, "at least 0 and at most 1 coat"),
+        (1, 1, "exactly 1 coat"),
+        (None, 0, "at most 0 coats"),
+    ],
+)
+def test_a_limit_of_one_is_in_the_singular(low: float | None, high: float | None, words: str) -> None:
+    assert limit(low, high, "coats") == words
