@@ -34,13 +34,13 @@ REDO_AT, HAND_OVER_AT = "Viewpoint capture at station 1", "Move the robot to sta
 REASON = "A drape hung into the picture"
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Walk through the demonstration, and list what was done."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--into", type=Path, default=FOLDER)
     parser.add_argument("--scene", type=int, default=7)
     parser.add_argument("--speed-up", type=float, default=6.0)
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     options.into.mkdir(parents=True, exist_ok=True)
     for old in options.into.glob("*.png"):
         old.unlink()

@@ -21,7 +21,7 @@ class ImagesTaken:
     given_up: int = 0
 
     @property
-    def left(self) -> int:
+    def to_come(self) -> int:
         """How many are still to come."""
         return max(self.known - self.taken - self.given_up, 0)
 
@@ -32,7 +32,7 @@ def images_taken(step: Step, now: StepState) -> ImagesTaken:
     if not planned:
         return ImagesTaken(len(now.captured), 0)
     sets: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
-    names = {viewpoint_name(one.prefix, i) for one in sets for i in range(one.count)}
+    names = {viewpoint_name(planned_set.prefix, i) for planned_set in sets for i in range(planned_set.count)}
     names |= {pose.viewpoint for plan in board_plans(now) for pose in plan.poses}
     names |= {view.viewpoint for note in suggested_views(now) for view in note.viewpoints}
     names |= {*now.captured, *now.skipped_viewpoints, *now.viewpoint_failures}

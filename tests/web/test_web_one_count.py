@@ -43,7 +43,7 @@ class Capturing:
     def record(self, *payloads: Payload) -> None:
         self.shown.site.store.record(self.shown.run, list(payloads), actor="grace")
 
-    def again(self, view: str) -> None:
+    def redo(self, view: str) -> None:
         act = {"action": "redo", "step": "capture", "viewpoint": view, "reason": "a hand was in it"}
         self.record(OperatorAction.model_validate(act))
 
@@ -65,7 +65,7 @@ def _all(run: Capturing) -> None:
 
 def _one_again(run: Capturing) -> None:
     run.take(*VIEWS)
-    run.again("v1_002")
+    run.redo("v1_002")
 
 
 def _one_taken_again(run: Capturing) -> None:
@@ -149,7 +149,7 @@ def test_a_stop_keeps_as_many_as_the_header_counts(capturing: Capturing, course:
     with capturing.shown.site.store.lease(capturing.shown.run, "test", 600.0):
         step = capturing.shown.words("")
     (taken, _) = re.findall(r"This step (\d+) of (\d+)", step)[0]
-    assert f"The {taken} images are kept." in step
+    assert f"Nothing. The {taken} images are" in step
 
 
 def test_a_deviation_has_one_name_on_the_page_of_the_run_and_in_the_audit(capturing: Capturing) -> None:

@@ -104,7 +104,7 @@ def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
 
 
 def test_a_stopped_or_lost_arm_is_said_before_all_else(shown: Shown) -> None:
-    """Whatever the run works on or was paused at: people who look from afar are told of the arm."""
+    """Whatever the run works on or was paused at: people who look from afar learn of the arm first."""
     said = {which: shown.stands(which) for which in _ROBOTS}
     assert {which for which, stands in said.items() if stands.key == "stopped"} == _STOPPED
     assert len({stands.why for which, stands in said.items() if which in _STOPPED}) == len(_STOPPED)

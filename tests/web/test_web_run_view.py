@@ -378,7 +378,7 @@ def test_photographs_of_the_layout_count_as_recorded() -> None:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "words"),
+    ("low", "high", "expected"),
     [
         (1, None, "at least 1 coat"),
         (2, None, "at least 2 coats"),
@@ -387,5 +387,5 @@ def test_photographs_of_the_layout_count_as_recorded() -> None:
         (None, 0, "at most 0 coats"),
     ],
 )
-def test_a_limit_of_one_is_in_the_singular(low: float | None, high: float | None, words: str) -> None:
-    assert limit(low, high, "coats") == words
+def test_a_limit_of_one_is_in_the_singular(low: float | None, high: float | None, expected: str) -> None:
+    assert limit(low, high, "coats") == expected

@@ -98,7 +98,7 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
         intervals = view_intervals_s(events)
     later = protocol.steps[protocol.index(state.current) :]
     views_left = sum(
-        images_taken(step, state.steps[step.id]).left for step in later if state.steps[step.id].phase != "passed"
+        images_taken(step, state.steps[step.id]).to_come for step in later if state.steps[step.id].phase != "passed"
     )
     each_s = median(intervals) if len(intervals) >= 2 else None
     return CaptureProgress(
@@ -108,7 +108,7 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
         left=_left(each_s, views_left),
         step_done=here.taken,
         step_total=here.known,
-        step_left=_left(each_s, here.left),
+        step_left=_left(each_s, here.to_come),
     )
 
 
