@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from service.audit.verify.judged_poses import verify_with_limits
 from service.audit.verify.verifications import keep_verification, verification_of
 from service.cli.audit_report import figures_command, report_command
 from service.cli.common import (
@@ -185,7 +186,7 @@ def verify_command(
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as report_progress:
             begun_s = time.monotonic()
-            report = audit.verify(
+            report = verify_with_limits(
                 data, run_id, report_progress, certificates=certificates, signatures_copy=signatures
             )
         _tell_the_pages(data, report, time.monotonic() - begun_s)

@@ -82,6 +82,11 @@ _DENSER_AZIMUTHS_DEG = (-80.0, -60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0, 80.0)
 _APART_M = 0.03  # views nearer than this to a planned one add little
 
 
+def viewpoint_name(prefix: str, index: int) -> str:
+    """Return the name of a planned viewpoint by its number in its set, from 0: `v1_001`."""
+    return f"{prefix}{index + 1:03d}"
+
+
 def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
     """Return all viewpoints of a set in the base frame of its station, in the order of capture.
 
@@ -104,7 +109,7 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
             roll = np.deg2rad(viewpoint_set.rolls_deg[i % len(viewpoint_set.rolls_deg)])
             top = _UP if viewpoint_set.image_top == "up" else -approach
             T_base_camera = look_at(eye, aim, top) @ _rotation_about_axis(roll)
-            viewpoints.append(Viewpoint(f"{viewpoint_set.prefix}{i + 1:03d}", layout.name, T_base_camera))
+            viewpoints.append(Viewpoint(viewpoint_name(viewpoint_set.prefix, i), layout.name, T_base_camera))
     if not viewpoints:
         raise NoViewpointError(
             f"viewpoint set {viewpoint_set.prefix!r} is empty", remedy="Give it at least one arc in the protocol"

@@ -51,6 +51,7 @@ SERVICE = {
 TESTS = {
     "tests/support/arms": "drivers and simulators of arms go by the host's clock",
     "tests/support/pages/browser.py": "a browser goes by the host's clock",
+    "tests/support/pages/technician.py": "a browser goes by the host's clock",
     "tests/support/pages/certificates.py": "certificates hold for the host's time",
     "tests/support/record/time_stamp_authority.py": "certificates hold for the host's time",
     "tests/support/processes": "other processes go by the host's clock; until() is how a test waits for one",

@@ -116,3 +116,16 @@ def run_protocol(web: WebSite, run: Bench) -> Protocol:
 def test_a_limit_from_above_and_one_that_is_not_decided() -> None:
     high = GateVerdict(measure="five_fold_rms_px", value=0.71, minimum=None, maximum=0.5, unit="px", passed=False)
     assert needs(high) == "RMS reprojection error in cross-validation 0.71 px, needs at most 0.5 px"
+
+
+def test_the_line_of_a_stop_is_short_and_place_and_remedy_stand_below(web: WebSite) -> None:
+    run = at_the_capture(web)
+    run.act("confirm", step="capture")
+    message = "nobody has let the arm move [127.0.0.1]. Look for the cause, and whether anybody is in reach"
+    failed = StepFailed(step="capture", attempt=1, error="LeaveNeededError", message=message, recovery="ask")
+    web.store.record(run.run_id, [StepStarted(step="capture", attempt=1), failed], actor="runner")
+    with driven(web, run):
+        page = plain(web.browser("technician").get(f"/runs/{run.run_id}").text)
+    assert "Stopped: Nobody has let the arm move →" in page
+    assert page.count("127.0.0.1") == 1
+    assert page.count("Look for the cause") == 1

@@ -292,3 +292,10 @@ def test_a_computer_that_is_too_busy_is_said_to_be(active: RunState) -> None:
     waits = banner(active, **told, robot_utc_s=NOW_S, starved_s=30)
     assert "planning the motion, for 40 s, of which it waited 30 s for a processor" in waits.text
     assert "for a processor" not in banner(active, **told, robot_utc_s=NOW_S, starved_s=1).text
+
+
+def test_a_step_that_computes_is_not_said_to_move_the_robot(active: RunState) -> None:
+    fields = {"at_utc_s": NOW_S, "doing": "working", "robot": "standing", "attended_utc_s": NOW_S}
+    shown = robot_banner(active, Snapshot.model_validate(fields), NOW_S, driven=True, moves=False)
+    assert shown.text.startswith("A step is under way. This step does not move it.")
+    assert "may move" not in shown.text

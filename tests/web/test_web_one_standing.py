@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import FilesKept, OperatorAction, RecordedView
+from service.core.records.events import DeviceOpened, DeviceTrouble, FilesKept, OperatorAction, RecordedView
 from service.core.recovery import ways_on
 from service.monitor.snapshot import RobotPhase, Snapshot, write_snapshot
 from service.people.person import ROLES, Role, may
@@ -24,10 +24,23 @@ from tests.support.pages.web import Browser, WebSite, web_site
 _PAGES = ("", "/capture", "/scene", "/calibration", "/dataset")
 _STATES = (
     "listing", "moving", "signing", "failed", "acceptable", "held", "calibrated", "completed", "paused", "died",
-    "aborted", "working", "arm_stopped",
+    "aborted", "working", "pausing", "arm_stopped", "arm_emergency", "arm_fault", "arm_lost",
 )  # fmt: skip
 # What the runner reported last of the robot.
-_ROBOTS: dict[str, RobotPhase] = {"working": "moving", "arm_stopped": "protective_stop"}
+_ROBOTS: dict[str, RobotPhase] = {
+    "working": "moving",
+    "pausing": "moving",  # a pause was asked for, and the motion under way is not over yet
+    "arm_stopped": "protective_stop",
+    "arm_emergency": "emergency_stop",
+    "arm_fault": "fault",
+    "arm_lost": "not_connected",
+}
+_BANNERS = {"pausing": "pausing", "arm_lost": "lost"}  # where the banner's key is not the robot's phase
+_STOPPED = {"arm_stopped", "arm_emergency", "arm_fault", "arm_lost"}
+_LOST = (
+    DeviceOpened(device="robot", report={"identity": {"kind": "robot"}}),
+    DeviceTrouble(device="robot", error="DeviceUnavailableError", message="no answer", connection="died"),
+)
 _MODES = {"ask", "sign", "recover", "work", "paused", "died", "ended"}
 
 
@@ -54,10 +67,11 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
         for run_id in (*recorded.under_way, runs["paused"], *(runs[name] for name in _ROBOTS)):
             web.site.launcher.start(run_id)
         for name, robot in _ROBOTS.items():
-            web.store.record(runs[name], [*BEGUN], actor="ada")
+            more = _LOST if name == "arm_lost" else ()
+            web.store.record(runs[name], [*BEGUN, *more], actor="ada")
             reported = {"at_utc_s": web.now_utc_s, "doing": "working", "robot": robot}
             write_snapshot(web.site.data, runs[name], Snapshot.model_validate(reported))
-        for name, verb in (("paused", "pause"), ("aborted", "abort")):
+        for name, verb in (("paused", "pause"), ("pausing", "pause"), ("aborted", "abort")):
             web.store.record(
                 runs[name], [OperatorAction.model_validate({"action": verb, "reason": "x"})], actor="ada"
             )
@@ -76,7 +90,7 @@ def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
     pages = {page: browser.get(f"/runs/{run_id}{page}").text for page in _PAGES}
     banners = {re.findall(r'data-robot="(\w+)"', html)[-1] for html in pages.values()}
     assert len(banners) == 1
-    assert which not in _ROBOTS or banners == {_ROBOTS[which]}
+    assert which not in _ROBOTS or banners == {_BANNERS.get(which, _ROBOTS[which])}
     for page, html in pages.items():
         alert = re.search(rf'data-attention="(\w+)" data-words="([^"]*)" data-of="{run_id}"', html)
         assert alert is not None, page
@@ -89,15 +103,24 @@ def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
     _counted(shown, pages[""], which)
 
 
+def test_a_stopped_or_lost_arm_is_said_before_all_else(shown: Shown) -> None:
+    """Whatever the run works on or was paused at: people who look from afar learn of the arm first."""
+    said = {which: shown.stands(which) for which in _ROBOTS}
+    assert {which for which, stands in said.items() if stands.key == "stopped"} == _STOPPED
+    assert len({stands.why for which, stands in said.items() if which in _STOPPED}) == len(_STOPPED)
+    for which in _STOPPED:
+        assert said[which].alert.lower().startswith(said[which].why.lower())
+
+
 def _listed(browser: Browser, run_id: str, stands: RunStanding) -> None:
     """What the first page says of the run."""
-    first, second = browser.get("/").text, browser.get("/?page=2").text
-    home = first if f'href="/runs/{run_id}"' in first else second
+    pages = [browser.get("/", params={"page": page}).text for page in (1, 2)]
+    mine = f'href="/runs/{run_id}"'
     if stands.mode == "ended":
-        (row,) = [row for row in home.split("<tr") if f'href="/runs/{run_id}"' in row]
+        (row,) = {row for home in pages for row in home.split("<tr") if mine in row}
         assert stands.word.lower() in words(row).lower()
         return
-    (row,) = [item for item in home.split("<li") if f'href="/runs/{run_id}"' in item and "<h3>" in item]
+    (row,) = {item for home in pages for item in home.split("<li") if mine in item and "<h3>" in item}
     assert stands.word in words(row)
     assert stands.why in words(row)
 

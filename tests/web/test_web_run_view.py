@@ -311,13 +311,13 @@ def test_the_time_left_is_measured_and_never_across_a_restart_or_a_pause() -> No
     assert view_of(log).progress.left == "measuring" or len(view_intervals_s(log.events)) >= 2
     while log.state.phase != "running":
         go(log, "on")
-    log.capture(["v1", "v2"])
+    log.capture(["v1_001", "v1_002"])
     log.append(SessionStarted(resumed=True, software={}, host="h", pid=1))
-    log.capture(["v3", "v4"])
+    log.capture(["v1_003", "v1_004"])
     log.act("pause")
     log.late_s = 600.0
     log.act("resume")
-    log.capture(["v5"])
+    log.capture(["v1_005"])
     assert view_intervals_s(log.events, "viewpoint_capture_1") == [1.0, 1.0]  # the log's clock: one second per event
     assert max(log.state.view_gaps_s) < 1.0
     assert view_of(log).progress.step_left == duration(3.0)
@@ -375,3 +375,17 @@ def test_photographs_of_the_layout_count_as_recorded() -> None:
     trouble = view_of(log).question.trouble
     assert trouble is not None
     assert trouble.safe == "Yes. 2 photographs are recorded, and every result so far."
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (1, None, "at least 1 coat"),
+        (2, None, "at least 2 coats"),
+        (0, 1, "at least 0 and at most 1 coat"),
+        (1, 1, "exactly 1 coat"),
+        (None, 0, "at most 0 coats"),
+    ],
+)
+def test_a_limit_of_one_is_in_the_singular(low: float | None, high: float | None, expected: str) -> None:
+    assert limit(low, high, "coats") == expected

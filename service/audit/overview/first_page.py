@@ -66,6 +66,11 @@ _NAMES: Mapping[str, str] = {
 }
 
 
+def kind_name(kind: str) -> str:
+    """Return what a kind of finding is called, in the audit and on the pages of the run."""
+    return _NAMES[kind]
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """A line in the list of deviations, or of what else is recorded."""
@@ -80,7 +85,7 @@ class Finding:
     @property
     def name(self) -> str:
         """The label of its kind."""
-        return _NAMES[self.kind]
+        return kind_name(self.kind)
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:

@@ -5,8 +5,8 @@
 
 Without -I, Python would take a module from beside this file, such as a forged hashlib.py, in place of its own.
 Needs Python 3.9 or newer and the package `cryptography`, nothing else and no network. Nothing is written.
-Exit status: 0 whole and unaltered; 1 something differs, and every difference is named; 2 nothing can be said, because
-this is not a bundle or `cryptography` is missing.
+Exit status: 0 whole and unaltered; 1 something differs, or a recorded pose contradicts the joints recorded with it,
+and each is named; 2 nothing can be said, because this is not a bundle or `cryptography` is missing.
 
 Every signature here is checked against keys that the bundle itself brings. That the bundle comes from whom it says
 it comes from, only a key's fingerprint tells, if you obtained it in another way: give it with --key.
@@ -82,6 +82,22 @@ UNPROVEN = (
 SIGNED_AT_ONCE = ("step_passed", "run_completed", "run_aborted")
 AFTER_A_SIGNATURE = ("step_started", "session_started", "run_completed", "run_aborted")  # recorded once that is done
 JOB_FIELDS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
+# Published lengths of the arms of Universal Robots: a2, a3, d1, d4, d5, d6 in metres, by the lower-case name that the
+# controller gives. It reports the tool, so a tool that nobody reckoned with shows in pose against joints.
+ARMS: dict[str, tuple[float, float, float, float, float, float]] = {
+    "ur3": (-0.24365, -0.21325, 0.1519, 0.11235, 0.08535, 0.0819),
+    "ur3e": (-0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
+    "ur5": (-0.425, -0.39225, 0.089159, 0.10915, 0.09465, 0.0823),
+    "ur5e": (-0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
+    "ur10": (-0.612, -0.5723, 0.1273, 0.163941, 0.1157, 0.0922),
+    "ur10e": (-0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
+    "ur16e": (-0.4784, -0.36, 0.1807, 0.17415, 0.11985, 0.11655),
+    "ur20": (-0.8620, -0.7287, 0.2363, 0.2010, 0.1593, 0.1543),
+    "ur30": (-0.6370, -0.5037, 0.2363, 0.2010, 0.1593, 0.1543),
+}
+TWISTS_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
+# A controller computes with the arm's factory calibration; of the published ones none differs by 6 mm from this.
+FITS_M, FITS_RAD = 0.010, math.radians(2.0)
 
 
 class NotABundleError(Exception):
@@ -477,6 +493,7 @@ class Check:
         self.manifest: dict[str, Any] = {}
         self.keys: dict[str, dict[str, Any]] = {}  # key_id → seq, replaced_seq, raw, vouched
         self.counts: dict[str, int] = {}
+        self.contradictions: list[dict[str, str]] = []  # recorded as they were, and yet wrong
 
     def fault(self, where: str, what: str) -> None:
         """Note something that is not as it should be."""
@@ -497,6 +514,8 @@ class Check:
             f"({payload.get('role')}) accepted them: {payload.get('reason')}"
             for seq, payload, actor in run.accepted
         ]
+        self.contradictions, notes = run.poses.findings(run.file)
+        self.notes += notes
         self._check_heads(run, site)
         rows = self._check_artefacts(bundle, run, whole)
         chains = {chain.run_id: chain for chain in (run, site)}
@@ -866,6 +885,7 @@ class Chain:
         self.to_sign: dict[int, int] = {}  # events that are signed at once → the event before which they are signed
         self._passed = 0  # the last event that is signed at once
         self.accepted: list[tuple[int, dict[str, Any], str]] = []  # figures outside their limits, and by whom
+        self.poses = Poses()
         self.first: dict[str, Any] | None = None
         self.end: tuple[Any, str] = (0, ROOT)
         for event in check.records(bundle, file, whole):  # both belong to this file
@@ -894,6 +914,7 @@ class Chain:
         self.first = self.first or payload
         kind = payload.get("kind")
         self._await_signature(seq, kind)
+        self.poses.add(seq, payload)
         if kind == "key_changed" and self.run_id == SITE:
             self.key_changes.append((seq, payload))
         elif kind == "run_signed":
@@ -913,6 +934,100 @@ class Chain:
             self.to_sign.setdefault(self._passed, seq)
         if kind in SIGNED_AT_ONCE:
             self._passed = seq
+
+
+class Poses:
+    """The views of a run: whether the pose of each fits the joints recorded with it."""
+
+    def __init__(self) -> None:
+        self._arms: dict[str, str] = {}  # device → model
+        self._away: dict[int, str] = {}  # event → what is wrong with its view
+        self._newest: dict[tuple[str, str, str], int] = {}  # view → its newest event
+        self._not_judged: dict[str, int] = {}  # reason → number of views
+
+    def add(self, seq: int, payload: Mapping[str, Any]) -> None:
+        """Look at an event; most say nothing of a pose."""
+        if payload.get("kind") == "device_opened":
+            self._open(payload)
+        elif payload.get("kind") == "viewpoint_captured":
+            self._look(seq, payload)
+
+    def _open(self, payload: Mapping[str, Any]) -> None:
+        report = payload.get("report")
+        identity = report.get("identity") if isinstance(report, dict) else None
+        if isinstance(identity, dict) and identity.get("kind") == "robot":
+            self._arms[str(payload.get("device"))] = str(identity.get("model"))
+
+    def _look(self, seq: int, payload: Mapping[str, Any]) -> None:
+        view = str(payload.get("viewpoint"))
+        self._newest[str(payload.get("step")), view, str(payload.get("station"))] = seq
+        reason = self._reason(payload.get("joints_rad"))
+        if reason:
+            self._not_judged[reason] = self._not_judged.get(reason, 0) + 1
+            return
+        try:
+            joints = [float(value) for value in payload["joints_rad"]]
+            pose = [[float(value) for value in row] for row in payload["T_base_flange"]]
+            gaps = [pose_gap(flange_pose(ARMS[model.lower()], joints), pose) for model in self._arms.values()]
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError):
+            self._away[seq] = f"joints and pose of {view} cannot be read as six angles and a pose"
+            return
+        if not any(distance_m <= FITS_M and angle_rad <= FITS_RAD for distance_m, angle_rad in gaps):
+            distance_m, angle_rad = min(gaps)
+            self._away[seq] = (
+                f"the pose of {view} is {1000 * distance_m:.0f} mm and {math.degrees(angle_rad):.1f}° from where its "
+                "recorded joints put the flange: the tool at the controller was not the one reckoned with"
+            )
+
+    def _reason(self, joints: Any) -> str:
+        """Return why a view with these joints is not judged; "" for one that is."""
+        if not self._arms:
+            return "the record names no arm that was connected before"
+        unknown = [model for model in self._arms.values() if model.lower() not in ARMS]
+        if unknown:
+            return f"this verifier does not judge an arm {unknown[0]!r}"
+        count = len(joints) if isinstance(joints, list) else 0
+        return "" if count == 6 else f"an arm with six joints has not the {count} that were recorded"
+
+    def findings(self, file: str) -> tuple[list[dict[str, str]], list[str]]:
+        """Return contradictions of views that count; and notes on those taken again since, or not judged."""
+        newest = set(self._newest.values())
+        found = [{"where": f"{file}, event {seq}", "what": what} for seq, what in self._away.items() if seq in newest]
+        notes = [
+            f"event {seq}: {what}. It was taken again since" for seq, what in self._away.items() if seq not in newest
+        ]
+        notes += [
+            f"pose and joints of {number} view{'s' * (number != 1)} are not compared, because {reason}"
+            for reason, number in self._not_judged.items()
+        ]
+        return found, notes
+
+
+def flange_pose(lengths: Sequence[float], joints_rad: Sequence[float]) -> list[list[float]]:
+    """Return the flange's pose, as four rows, at six joints."""
+    a2, a3, d1, d4, d5, d6 = lengths
+    pose: list[list[float]] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    links = zip((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), TWISTS_RAD, joints_rad)  # noqa: B905
+    for a, d, alpha, theta in links:
+        ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
+        link = (
+            (ct, -st * ca, st * sa, a * ct),
+            (st, ct * ca, -ct * sa, a * st),
+            (0.0, sa, ca, d),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+        pose = [[sum((row[k] * link[k][j] for k in range(4)), 0.0) for j in range(4)] for row in pose]
+    return pose
+
+
+def pose_gap(left: Sequence[Sequence[float]], right: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """Return the distance (m) and the angle (rad) between two poses. Raises ValueError for what is no pose."""
+    if len(right) != 4 or any(len(row) != 4 for row in right):
+        raise ValueError("it is not a pose")
+    turn = [[sum(left[k][i] * right[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    sine = math.sqrt((turn[2][1] - turn[1][2]) ** 2 + (turn[0][2] - turn[2][0]) ** 2 + (turn[1][0] - turn[0][1]) ** 2)
+    distance_m = math.sqrt(sum((left[i][3] - right[i][3]) ** 2 for i in range(3)))
+    return distance_m, math.atan2(sine, turn[0][0] + turn[1][1] + turn[2][2] - 1.0)
 
 
 def _heads(value: Any) -> dict[str, tuple[int, str]]:
@@ -1143,7 +1258,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if options.json:
         result = {
-            "ok": not check.faults,
+            "ok": not check.faults and not check.contradictions,
             "run_id": check.manifest["run_id"],
             "simulated": check.manifest["simulated"],
             "head": check.manifest["head"],
@@ -1151,12 +1266,13 @@ def main(arguments: list[str] | None = None) -> int:
             "keys": list(check.keys),
             "counts": check.counts,
             "faults": check.faults,
+            "contradictions": check.contradictions,
             "notes": check.notes,
         }
         sys.stdout.write(json.dumps(result, indent=1) + "\n")
     else:
         sys.stdout.write(report(check))
-    return 1 if check.faults else 0
+    return 1 if check.faults or check.contradictions else 0
 
 
 def report(check: Check) -> str:
@@ -1176,6 +1292,12 @@ def report(check: Check) -> str:
         lines += [f"  {fault['where']}: {fault['what']}" for fault in check.faults]
     else:
         lines.append("WHOLE AND UNALTERED: every file, record, link and signature is as it was recorded.")
+    if check.contradictions:
+        number = len(check.contradictions)
+        lines.append(
+            f"BUT {number} VIEW{'S' * (number != 1)} CANNOT BE RIGHT: pose and joints contradict each other."
+        )
+        lines += [f"  {view['where']}: {view['what']}" for view in check.contradictions]
     return "".join(f"{shown(line)}\n" for line in lines)
 
 

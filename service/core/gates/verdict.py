@@ -115,10 +115,14 @@ def quantity(value: float | None, unit: str = "") -> str:
     """Return a number with its unit, for people: `8 images`, `1 image`, `0.71 px`; `not measured` for None."""
     if value is None:
         return "not measured"
-    if value == 1 and unit.endswith("s") and unit not in _UNITS_IN_S:
-        unit = unit[:-1]
+    unit = unit_of(value, unit)
     text = f"{value:.0f}" if value == int(value) and abs(value) < _LARGEST_WHOLE else f"{value:.4g}"
     return f"{text} {unit}".rstrip()
+
+
+def unit_of(value: float, unit: str) -> str:
+    """Return the unit as it is written behind a number: `image` behind 1, and `images` behind all others."""
+    return unit[:-1] if value == 1 and unit.endswith("s") and unit not in _UNITS_IN_S else unit
 
 
 def _places(apart: float) -> int:

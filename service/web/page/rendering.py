@@ -19,6 +19,7 @@ from jinja2 import Environment, PackageLoader, PrefixLoader, StrictUndefined, se
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
+from service.audit.overview.first_page import kind_name
 from service.core.errors import ConfigurationError, DataError, IntegrityError, OrthocaptureError, ProtocolError
 from service.core.records.entered import RunAbout, about_rows
 from service.core.text.words import counted, local_time
@@ -73,6 +74,7 @@ def entered_of(root: EventRow) -> list[tuple[str, str]]:
 # Its type names its own names only.
 cast("dict[str, Any]", TEMPLATES.globals).update(kept_in_a_row=kept_in_a_row, about_rows=entered_of, counted=counted)
 TEMPLATES.filters["local_time"] = local_time
+TEMPLATES.filters["finding_name"] = kind_name
 
 
 def part_names(*names: str) -> Any:

@@ -50,7 +50,9 @@ LOST = Banner(
 )
 
 
-def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, driven: bool, tries: str = "") -> Banner:
+def robot_banner(
+    state: RunState, snapshot: Snapshot, now_utc_s: float, *, driven: bool, tries: str = "", moves: bool = True
+) -> Banner:
     """Return what to say of the robot; what is not known for certain is shown as unknown.
 
     Args:
@@ -59,9 +61,10 @@ def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, drive
         now_utc_s: now, in seconds since the epoch.
         driven: true if that program runs.
         tries: a text on what failed and is tried again by itself; "" for nothing.
+        moves: true if the present step moves the robot.
     """
     lost = lost_arms(state)
-    banner = _present(state, snapshot, now_utc_s, tries, driven=driven)
+    banner = _present(state, snapshot, now_utc_s, tries, driven=driven, moves=moves)
     if not lost:
         return banner
     look = tuple(LookAt(name, loss.seq) for name, loss in lost.items())
@@ -99,7 +102,7 @@ def _loss_words(name: str, loss: Loss) -> str:
 
 
 def _present(  # noqa: PLR0911 - one return a case
-    state: RunState, snapshot: Snapshot, now_utc_s: float, tries: str, *, driven: bool
+    state: RunState, snapshot: Snapshot, now_utc_s: float, tries: str, *, driven: bool, moves: bool
 ) -> Banner:
     """Return what to say of the robot as if every loss of a connection had been seen to."""
     if snapshot.doing in ("unknown", "ended") and not driven and connected_arms(state) and _left(state, snapshot):
@@ -131,7 +134,8 @@ def _present(  # noqa: PLR0911 - one return a case
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot may still move. Wait for Paused.")
     if snapshot.doing != "working":
         return Banner("standing", "standing", "standing", "The robot stands still.", NOT_THE_STOP)
-    text = _joined(_again(tries), _busy(snapshot), "It may move at any moment.")
+    may = "It may move at any moment." if moves else f"This step does not move it. {NOT_THE_STOP}"
+    text = _joined(_again(tries), _busy(snapshot), may)
     return Banner("standing", "standing", "standing", "The robot stands still.", text)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from service.core.errors import OrthocaptureError
+from service.core.errors import OrthocaptureError, what_of
 from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import Standing as GateStanding
-from service.core.gates.verdict import figure, standing
+from service.core.gates.verdict import figure, standing, unit_of
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import GateVerdict
 from service.core.records.import_list import imported_sentence
@@ -38,9 +38,11 @@ def drawing_of(step: Step) -> str:
 def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
     """Return the limits as text: `at least 0.2 and at most 1 mm`, `exactly 13 spheres`."""
     if minimum is not None and minimum == maximum:
-        return f"exactly {minimum:g} {unit}".rstrip()
+        return f"exactly {minimum:g} {unit_of(minimum, unit)}".rstrip()
     low = "" if minimum is None else f"at least {minimum:g}"
     high = "" if maximum is None else f"at most {maximum:g}"
+    last = maximum if maximum is not None else minimum
+    unit = unit if last is None else unit_of(last, unit)
     return f"{' and '.join(text for text in (low, high) if text) or 'no limit'} {unit}".rstrip()
 
 
@@ -92,7 +94,7 @@ def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) ->
     now = state.step
     failed = [needs(verdict) for verdict in now.verdicts if not verdict.passed]
     if now.failure is not None:
-        why = sentence(now.failure.message).rstrip(".")
+        why = sentence(what_of(now.failure.message)).rstrip(".")  # the place and the remedy stand below
     else:
         why = "; ".join(failed) or sentence(question.text).rstrip(".")
     way = next((way for way in question.ways if way.available), None)
@@ -284,7 +286,12 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         asked=(holder.screen, holder.asked_by_name),
         attention=Attention(stands.key, stands.alert),
         banner=robot_banner(
-            log.state, snapshot, now_utc_s, driven=driven, tries=tries_words(log.protocol, log.state, time_here)
+            log.state,
+            snapshot,
+            now_utc_s,
+            driven=driven,
+            tries=tries_words(log.protocol, log.state, time_here),
+            moves=log.protocol.step(log.state.current).moves_robot,
         ),
         tabs=(
             Tab(here, "Step"),

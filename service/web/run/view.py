@@ -10,7 +10,7 @@ from service.core.disk_space import Forecast
 from service.core.gates.acceptance import acceptors, demanded_role, dependent_steps, depends_on, failed_gates
 from service.core.protocol.models import Protocol, Step, irreversible_warning
 from service.core.records.events import Event, FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
-from service.core.recovery import WayOn, planned_views, takes_words
+from service.core.recovery import WayOn, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.decide import AskOperator, lapsed_words
 from service.core.run.expected import EarlierTimes, away_words, run_words, step_words, tries_words, work_words
@@ -19,6 +19,7 @@ from service.core.text.words import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.run_record import OpenJob
+from service.steps.images_taken import images_taken
 from service.web.page.run_frame import (
     count,
     drawing_of,
@@ -197,6 +198,7 @@ def _shown(
     now = state.steps[step.id]
     checks = tuple(ChecklistItem(item, item in now.ticked) for item in step.checklist)
     undone = step.irreversible and now.phase != "passed"
+    images = images_taken(step, now)
     return StepView(
         id=step.id,
         title=step.title,
@@ -216,9 +218,9 @@ def _shown(
         gates=gate_lines(step, now, state.skipped),
         warning=irreversible_warning(protocol, step) if undone else "",
         requires=tuple((protocol.step(name).title, state.steps[name].passed_its_gates) for name in step.requires),
-        captured=len(now.captured),
+        captured=images.taken,
         unused=unused,
-        planned=planned_views(step),
+        planned=images.known,
         signed_by=now.signed_by,
         skipped=now.skipped,
         started_utc=now.started_utc,

@@ -16,11 +16,11 @@ from service.core.gates.measure_names import measure_name
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import Event, GateVerdict, OperatorAction, OperatorVerb, RecordedView, SessionStarted
-from service.core.recovery import planned_views
 from service.core.run.expected import duration
 from service.core.run.state import Deviation, RunState, StepState
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
+from service.steps.images_taken import images_taken
 from service.web.page.run_frame import gate_word, limit
 
 _GIB = 2.0**30
@@ -90,19 +90,15 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str],
 def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> CaptureProgress:
     """Count the progress from the record; estimate the time left from the times between this run's own exposures."""
     data_set = [s for s in protocol.steps if getattr(s.params, "purpose", "") == "dataset"]
-    total = sum(planned_views(step) for step in data_set)
-    done = sum(min(len(state.steps[step.id].captured), planned_views(step)) for step in data_set)
-    here = protocol.step(state.current)
-    step_total = planned_views(here)
-    step_done = min(len(state.step.captured), step_total)
+    counts = [images_taken(step, state.steps[step.id]) for step in data_set]
+    total, done = sum(count.known for count in counts), sum(count.taken for count in counts)
+    here = images_taken(protocol.step(state.current), state.step)
     intervals = view_intervals_s(events, state.current)
     if len(intervals) < 2:
         intervals = view_intervals_s(events)
     later = protocol.steps[protocol.index(state.current) :]
     views_left = sum(
-        max(planned_views(step) - len(state.steps[step.id].captured), 0)
-        for step in later
-        if state.steps[step.id].phase != "passed"
+        images_taken(step, state.steps[step.id]).to_come for step in later if state.steps[step.id].phase != "passed"
     )
     each_s = median(intervals) if len(intervals) >= 2 else None
     return CaptureProgress(
@@ -110,9 +106,9 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
         total=total,
         percent=100.0 * done / total if total else 0.0,
         left=_left(each_s, views_left),
-        step_done=step_done,
-        step_total=step_total,
-        step_left=_left(each_s, step_total - step_done),
+        step_done=here.taken,
+        step_total=here.known,
+        step_left=_left(each_s, here.to_come),
     )
 
 

@@ -7,26 +7,21 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
-from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_people, follow, screen, served
-from tests.support.processes.waiting import until
+from tests.support.pages.browser import DESKTOP, PASSWORD, Served, add_people, follow, screen, served
+from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(1800)]
 
-MOST_MENDS = 4  # per step, as of the automatic operator
-PRESSED_IN_VAIN = 3  # in the whole run
-ANSWER_MS = 60_000  # after which the page does not answer a press any more
 STEP_S = 400  # after which a step, of seconds on a quiet machine, does not end any more
 
 
@@ -91,97 +86,6 @@ def run(server: Served, browser: Browser) -> str:
         assert technician.held >= 5  # calibration and four captures
         assert technician.signed >= 3  # before irreversible changes of the scene
     return name
-
-
-class Technician:
-    """Reads the page and does the one thing that it asks for, without knowing the protocol."""
-
-    def __init__(self, tablet: Screen) -> None:
-        self.tablet, self.page = tablet, tablet.page
-        self.held = self.signed = self.in_vain = 0
-        self.mends: Counter[str] = Counter()  # title of a step → number of times its advice was followed
-
-    def do_what_is_asked(self) -> None:
-        """Tick, sign, confirm or hold, or follow advice; wait while the software works."""
-        page = self.page
-        trouble = page.locator(".notice-stop:has(dl)")  # what happened, and what helps
-        if trouble.count():
-            self._follow_advice(trouble)
-            return
-        unticked = page.locator("[role=checkbox][aria-checked=false]:not([disabled])")
-        if unticked.count():
-            before = unticked.count()
-            unticked.first.click()
-            expect(unticked).to_have_count(before - 1, timeout=ANSWER_MS)
-            return
-        actions = page.locator(".actions")
-        sign = actions.get_by_role("button", name=re.compile("^Sign"))
-        confirm = actions.get_by_role("button", name=re.compile("^(Confirm:|Take photograph)"))
-        if sign.count() and sign.is_visible():
-            self._sign(sign)
-        elif confirm.count() and confirm.is_enabled(timeout=1_000):
-            self._confirm(confirm)
-        else:
-            page.wait_for_timeout(400)
-
-    def _follow_advice(self, trouble: Locator) -> None:
-        """Try again where the page recommends it and says what helps; any other trouble is an error.
-
-        On a busy machine the watchdog may stop the arm: the page says so, and that a person must permit motion again.
-        """
-        words = trouble.inner_text(timeout=1_000)
-        recommended = self.page.locator("table.ways tbody tr").first.inner_text(timeout=1_000)
-        assert "What helps" in words or "gave no sign of life" in words, words
-        assert "Recommended" in recommended, words
-        assert "with the large button below" in recommended, words
-        step = self.page.get_by_role("heading", level=1).inner_text()
-        self.mends[step] += 1
-        assert self.mends[step] <= MOST_MENDS, words
-        again = self.page.locator(".actions").get_by_role("button", name=re.compile("^Try again"))
-        self._confirm(again)
-
-    def _sign(self, sign: Any) -> None:
-        asked = self._asked()
-        sign.click()
-        self.page.get_by_label("Your password").fill(PASSWORD)
-        self.page.get_by_role("button", name="Sign", exact=True).click()
-        expect(self.page.locator("dialog[open]")).to_have_count(0, timeout=ANSWER_MS)
-        self.signed += 1
-        self._until_something_else_is_asked(asked, lambda: sign.count() == 0)
-
-    def _confirm(self, confirm: Any) -> None:
-        asked = self._asked()
-        if confirm.get_attribute("data-hold", timeout=1_000):
-            confirm.hover()
-            self.page.mouse.down()
-            self.page.wait_for_timeout(1800)
-            until(lambda: confirm.locator("xpath=self::*[contains(@class, 'held')]").count() == 0, "it was held")
-            self.page.mouse.up()
-            self.held += 1
-        else:
-            confirm.click(timeout=5_000)
-        self._until_something_else_is_asked(
-            asked, lambda: confirm.count() == 0 or not confirm.is_enabled(timeout=1_000)
-        )
-
-    def _asked(self) -> tuple[str, str]:
-        """The step, and the offered actions; the question may change between two calls."""
-        heading = self.page.get_by_role("heading", level=1).inner_text(timeout=5_000)
-        return heading, self.page.locator(".actions").inner_text(timeout=5_000)
-
-    def _until_something_else_is_asked(self, asked: tuple[str, str], gone: Callable[[], bool]) -> None:
-        """Wait until another step comes, the same step asks for something else, or the page gives a reason.
-
-        While a page on a busy machine has lost its connection, a press has no effect; the technician then presses
-        again.
-        """
-        deadline_s = time.monotonic() + 20
-        while self._asked() == asked and not gone() and not self.page.locator("#problem").is_visible():
-            if time.monotonic() > deadline_s:
-                self.in_vain += 1
-                assert self.in_vain <= PRESSED_IN_VAIN, f"{asked}: {self.tablet.words()}"
-                return
-            self.page.wait_for_timeout(200)
 
 
 def test_the_technician_sees_the_accuracy_at_the_end(server: Served, browser: Browser, run: str) -> None:

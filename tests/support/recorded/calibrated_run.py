@@ -148,6 +148,7 @@ def capture(
     shade: int = 0,
     name: str = "DSC00001.JPG",
     further: Mapping[str, bool] | None = None,
+    attempt: int = 1,
 ) -> str:
     """Record one exposure; returns the photograph's hash.
 
@@ -158,7 +159,7 @@ def capture(
     ref = _put(site, cv2.imencode(".jpg", pixels)[1].tobytes(), kind, "image/jpeg", name)
     payload = ViewpointCaptured(
         step=step,
-        attempt=1,
+        attempt=attempt,
         viewpoint=viewpoint,
         station="station_1",
         artefacts=(ref,),
