@@ -15,9 +15,10 @@ export PYTHONDONTWRITEBYTECODE =
 demo: $(READY)
 	$(BIN)/orthocapture demo
 
-# Units, wires and one short run, in minutes; nothing of it needs more than Python and what pip installs.
+# Units, wires and one short run, in minutes; nothing of it needs more than Python and what pip installs. All tests of
+# tests/browser do need more, and are not even read.
 test: $(TOOLS)
-	$(BIN)/pytest -m "not (slow or realtime or packages or whole or sweep)"
+	$(BIN)/pytest -m "not (slow or realtime or packages or whole or sweep)" --ignore=tests/browser
 
 # All tests: those that meet the clock run alone, after the others.
 test-all: $(TOOLS) $(NETWORKS)

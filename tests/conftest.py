@@ -65,6 +65,12 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(Draw(seed))
 
 
+@pytest.fixture
+def one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have jobs and commands compute within this process: to start more takes longer than what these would do."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return two workers a processor: tests of devices and servers wait for half of their time."""

@@ -43,7 +43,7 @@ def centre_errors_px(outlines: list[dict[str, Any]], T_camera_world: Array, scen
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("one_processor")
 def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path) -> None:
     scene = Scene.generate(5)
     lens = scene.camera_intrinsics(WIDTH)
@@ -77,9 +77,10 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             assert done.answer.parameters.gamma == (1.0, 1.0)
             (tiff,) = done.artefacts
             assert (tiff.kind, tiff.media_type, tiff.original_name) == ("developed", "image/tiff", f"{name}.tif")
-            again = run("develop", viewpoint=name, raw=raw, jpeg=jpeg, parameters=done.answer.parameters.plain())
-            assert again.artefacts[0].sha256 == tiff.sha256, "a replay gives the same file"
             developed[name] = tiff.sha256
+            if number == 0:
+                again = run("develop", viewpoint=name, raw=raw, jpeg=jpeg, parameters=done.answer.parameters.plain())
+                assert again.artefacts[0].sha256 == tiff.sha256, "a replay gives the same file"
         search = {
             "images": views, "camera": asdict(camera), "spheres_m": scene.registration_m.tolist(),
             "sphere_covariance_m2": [(1e-10 * np.eye(3)).tolist()] * 10, "radius_m": scene.radius_m,
@@ -90,9 +91,9 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             assert ("outlines_not_in_raw" in done.measures) == (where == "raw")
             found[where] = JobContext({}, store, tmp_path, lambda *_: None).input_json(done.artefacts[0].sha256)
             assert done.measures["outlines"] == sum(map(len, found[where].values())) >= 16
+        smaller = {"images": views[:1], "camera": asdict(camera.scaled(600, 400)), "reduced_to": [600, 400]}
         with pytest.raises(DataError, match=r"1200×800 pixels.*JPEG's size"):
-            run("detect_spheres", **search | {"camera": asdict(camera.scaled(600, 400)), "reduced_to": [600, 400]},
-                developed=developed)  # fmt: skip
+            run("detect_spheres", **search | smaller, developed=developed)
     errors = {
         where: np.concatenate([
             centre_errors_px(outlines[view["viewpoint"]], inverse(np.array(view["T_scene_camera"])), scene, camera)

@@ -109,6 +109,7 @@ def test_odd_files_are_left_out_by_name(odd: BoardFolder, tmp_path: Path, comman
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_processor")
 def test_images_without_a_pose_are_left_out_by_name(photographs: BoardFolder, tmp_path: Path) -> None:
     T = dict(list(photographs.T_base_flange.items())[1:])
     fewer = BoardFolder(photographs.images, photographs.camera, T)

@@ -86,9 +86,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 @pytest.fixture
-def few(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Three of the photographs, processed within this process because starting workers takes longer."""
-    monkeypatch.setattr("service.cli.register.os.cpu_count", lambda: 1)
+def few(capture: Capture, tmp_path: Path, one_processor: None) -> Path:
+    """Three of the photographs, processed within this process."""
     folder = tmp_path / "few"
     folder.mkdir()
     for name in ("DSC00001.JPG", "DSC00003.JPG", "DSC00005.JPG"):

@@ -32,7 +32,7 @@ from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_r
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
-SMALL = ("--scene", "3", "--image-width", "240", "--speed-up", "10")
+SMALL = ("--scene", "3", "--image-width", "240", "--speed-up", "10", "--scan-spacing-mm", "1.2")
 # These rigs use an address of their own, so that they do not wait for those of other tests.
 OWN_HOST = "127.0.0.61"
 

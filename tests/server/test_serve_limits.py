@@ -255,7 +255,6 @@ def test_a_forwarded_address_passes_no_limit_stands_in_no_record_and_a_restart_f
         assert 0 < int(refused.headers["retry-after"]) <= 300
 
 
-@pytest.mark.slow
 def test_of_a_trusted_proxys_words_the_last_stranger_counts(rig: Path) -> None:
     with serving(rig, "--trusted-proxy", "127.0.0.1", "--trusted-proxy", "2001:db8::5") as server:
         for forwarded in (

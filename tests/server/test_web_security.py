@@ -6,21 +6,21 @@ import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import httpx
 import pytest
-import schemathesis
 from fastapi.routing import iter_route_contexts
 from hypothesis import HealthCheck, Phase, given, seed, settings
-from schemathesis.checks import not_a_server_error
-from schemathesis.core.result import Ok
-from schemathesis.schemas import APIOperation
 
 from service.people.person import ROLES, Role, may
 from service.web.security import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
 from tests.support.pages.web import HOST, PIN, Browser, WebSite, web_site
+
+if TYPE_CHECKING:
+    from schemathesis import Case
+    from schemathesis.schemas import APIOperation
 
 HOSTILE = (
     "..",
@@ -227,15 +227,18 @@ def test_a_refused_form_does_not_repeat_what_was_typed(site: WebSite, caplog: py
 
 
 @pytest.fixture(scope="module")
-def cases(tmp_path_factory: pytest.TempPathFactory) -> list[schemathesis.Case[Any]]:
+def cases(tmp_path_factory: pytest.TempPathFactory) -> list[Case[Any]]:
     """Requests to every operation, the same for each role; to draw them costs as much as to send them."""
+    import schemathesis  # noqa: PLC0415 - a second, which every process would pay
+    from schemathesis.core.result import Ok  # noqa: PLC0415
+
     with web_site(tmp_path_factory.mktemp("described")) as site:
         schema = schemathesis.openapi.from_dict(site.app.openapi())
     operations: list[APIOperation[Any, Any, Any, Any]] = [
         result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)
     ]
     assert len(operations) > 40
-    drawn: list[schemathesis.Case[Any]] = []
+    drawn: list[Case[Any]] = []
     for operation in operations:
 
         @seed(7)
@@ -247,7 +250,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[schemathesis.Case[An
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
         )
         @given(case=operation.as_strategy())
-        def one(case: schemathesis.Case[Any]) -> None:
+        def one(case: Case[Any]) -> None:
             drawn.append(case)
 
         one()
@@ -268,8 +271,10 @@ ALWAYS: tuple[Role, ...] = ("administrator", "technician")  # those who may chan
     ],
 )
 def test_generated_requests_never_break_the_server(
-    cases: list[schemathesis.Case[Any]], tmp_path_factory: pytest.TempPathFactory, role: Role | None
+    cases: list[Case[Any]], tmp_path_factory: pytest.TempPathFactory, role: Role | None
 ) -> None:
+    from schemathesis.checks import not_a_server_error  # noqa: PLC0415
+
     with web_site(tmp_path_factory.mktemp("generated")) as site:
         run_id = site.begin_run().run_id
         for case in cases:
@@ -280,7 +285,7 @@ def test_generated_requests_never_break_the_server(
             case.validate_response(answer, checks=[not_a_server_error])
 
 
-def _send(site: WebSite, run_id: str, role: Role | None, case: schemathesis.Case[Any]) -> httpx.Response:
+def _send(site: WebSite, run_id: str, role: Role | None, case: Case[Any]) -> httpx.Response:
     browser = _screen(site, run_id, role)
     sent = case.as_transport_kwargs(base_url=HOST)
     headers = {**(sent.get("headers") or {})}

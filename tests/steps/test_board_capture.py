@@ -51,7 +51,9 @@ def test_planned_poses_pass_at_the_first_attempt_without_a_cut_board(begin: Call
 
 
 @pytest.mark.slow
-def test_images_without_a_board_are_replaced_in_the_same_attempt(begin: Callable[[str], Bench]) -> None:
+def test_images_without_a_board_and_a_blurred_one_are_replaced_in_the_same_attempt(
+    begin: Callable[[str], Bench],
+) -> None:
     bench = begin(PROTOCOL)
     room = board_room(bench)
 
@@ -60,7 +62,7 @@ def test_images_without_a_board_are_replaced_in_the_same_attempt(begin: Callable
             return np.zeros_like(picture)
         if exposure == 9:
             return np.full_like(picture, 90)
-        return picture
+        return blurred(picture) if exposure == 12 else picture
 
     room.spoil = spoil
     state = bench.run()
@@ -68,14 +70,18 @@ def test_images_without_a_board_are_replaced_in_the_same_attempt(begin: Callable
     assert not bench.payloads(StepRetried)
     captured = bench.captured()
     replaced = [plan for plan in plans(bench) if plan["why"] == "replacement"]
-    assert sum(len(plan["poses"]) for plan in replaced) == 2
+    assert sum(len(plan["poses"]) for plan in replaced) == 3
     reasons = {name: why for plan in replaced for name, why in plan["instead_of"].items()}
-    assert set(reasons) == {captured[2], captured[8]}
+    assert set(reasons) == {captured[2], captured[8], captured[11]}
     assert reasons[captured[2]] == "the image is black"
     assert "no board" in reasons[captured[8]]
-    assert len(captured) == 16
+    assert "blurred, its edges are" in reasons[captured[11]]
+    assert len(captured) == 17
     assert state.steps["calibration"].measures["views"] == 14
     assert any(f"{captured[2]}: not used" in line for line in bench.operator.told)
+    solved = state.steps["calibration"].result["details"]["intrinsics"]["images"]
+    assert len(solved) == 14
+    assert not set(reasons) & set(solved)
 
 
 @pytest.mark.slow
@@ -159,23 +165,6 @@ def test_the_board_on_its_other_side_stops_after_a_few_images(begin: Callable[[s
     assert "the first images show no board" in texts[0]
     assert "the image is black" in texts[0]
     bench.must_verify()
-
-
-@pytest.mark.slow
-def test_a_single_blurred_image_is_replaced_and_not_calibrated_from(begin: Callable[[str], Bench]) -> None:
-    bench = begin(PROTOCOL)
-    room = board_room(bench)
-    room.spoil = lambda exposure, picture: blurred(picture) if exposure == 8 else picture
-    state = bench.run()
-    assert state.status == "completed"
-    assert not bench.payloads(StepRetried)
-    (replaced,) = [plan for plan in plans(bench) if plan["why"] == "replacement"]
-    ((name, why),) = replaced["instead_of"].items()
-    assert name == bench.captured()[7]
-    assert "blurred, its edges are" in why
-    solved = state.steps["calibration"].result["details"]["intrinsics"]["images"]
-    assert len(solved) == 14
-    assert name not in solved
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from service.people.person import Role
 from service.people.sessions import People
 from service.store.store import Store
 from tests.support.processes.forked import Forked
+from tests.support.processes.quick_hashes import QuickHasher
 from tests.support.processes.runners import end_runners
 from tests.support.rig.rig import REPOSITORY, command
 
@@ -183,7 +184,7 @@ def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
 def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
     """Create accounts with PASSWORD and PIN as the pages do: an administrator invites, people accept."""
     with Store.open(data) as store:
-        desk = People(store)
+        desk = People(store, QuickHasher())
         desk.accounts.set_up(desk.first_link() or "", "ada", "Ada Example", PASSWORD, PIN)
     invite_people(data, people)
 
@@ -191,7 +192,7 @@ def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
 def invite_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
     """Create further accounts of that kind: the administrator Ada is there already."""
     with Store.open(data) as store:
-        desk = People(store)
+        desk = People(store, QuickHasher())
         token = desk.sign_in("ada", PASSWORD)
         administrator = desk.person(token, idle_lock_s=600, deliberate=True)
         assert administrator is not None

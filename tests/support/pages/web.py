@@ -14,7 +14,6 @@ from typing import Any
 
 import httpx
 from anyio.from_thread import BlockingPortal, start_blocking_portal
-from argon2 import PasswordHasher
 from fastapi import FastAPI
 
 from service.people.control import Control
@@ -28,6 +27,7 @@ from service.web.app import create_app
 from service.web.security import cookie_name
 from service.web.site import Launcher, Site
 from tests.support.processes.forked import pages_fork
+from tests.support.processes.quick_hashes import QuickHasher
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
 
@@ -38,7 +38,7 @@ with warnings.catch_warnings():
 
 HOST = "https://testserver"
 PIN = "2468"
-QUICK_HASHES = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+QUICK_HASHES = QuickHasher()
 NAMES: dict[Role, str] = {
     "technician": "Grace Hopper",
     "supervisor": "Emmy Noether",

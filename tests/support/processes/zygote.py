@@ -4,8 +4,8 @@
 it cannot outlive the tests. `tests.support.processes.forked` is the other end. A request forks a child that is the
 same as a fresh `python -m MODULE WORDS…` or `orthocapture WORDS…`: it leaves this module by returning from it, runs
 the program as `__main__`, and the interpreter ends it as any other: exit status, tracebacks, `atexit` and all. What
-differs from a fresh process: modules are loaded already, `ps` shows the command line of the zygote, and all children
-of one zygote share the seed of `hash()`.
+differs from a fresh process: modules are loaded already, `ps` shows the command line of the zygote, all children of
+one zygote share the seed of `hash()`, and passwords are hashed at the least cost.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ import sys
 import time
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
+
+from tests.support.processes.quick_hashes import hash_quickly
 
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
 # What the pages start: modules of the program, each with those that it imports only once it needs them.
@@ -166,6 +168,7 @@ class _Zygote:
         for name in needed:
             with contextlib.suppress(ModuleNotFoundError):  # the library of a device may not be installed
                 importlib.import_module(name)
+        hash_quickly()
         assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"
         gc.collect()
         gc.freeze()  # the children's collections leave alone, and so share, what is here

@@ -87,14 +87,16 @@ def render(
     """Grey image (height, width), 2 × 2 supersampled, with a little noise."""
     fine = camera.scaled(2 * camera.width, 2 * camera.height)
     rays: Array = _camera_rays(fine) @ T_world_camera[:3, :3].T
+    across, along = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     eye = T_world_camera[:3, 3]
     image = np.full(len(rays), 60.0, dtype=np.float32)
     for slab in sorted(scene, key=lambda s: s.z):  # seen from above: higher slabs hide lower ones
-        points = eye + rays * ((slab.z - eye[2]) / rays[:, 2])[:, None]
-        inside = np.all((points[:, :2] > slab.low) & (points[:, :2] < slab.high), axis=1)
-        u = ((points[inside, :2] - slab.low) / TEXEL_M).astype(np.float32)
-        if len(u):
-            image[inside] = _sample(slab.texture, u)
+        down = slab.z - eye[2]
+        x, y = eye[0] + down * across, eye[1] + down * along
+        inside = (x > slab.low[0]) & (x < slab.high[0]) & (y > slab.low[1]) & (y < slab.high[1])
+        if inside.any():
+            u = np.stack([x[inside], y[inside]], axis=1) - slab.low
+            image[inside] = _sample(slab.texture, (u / TEXEL_M).astype(np.float32))
     small = cv2.resize(
         image.reshape(fine.height, fine.width), (camera.width, camera.height), interpolation=cv2.INTER_AREA
     )
