@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from bench.suite.marks import costs_of, disagreements, remarked, settled
 from tests.plugins.collecting import dearest_first, is_compiled
 from tests.plugins.cost_limit import CostLimit
 from tests.plugins.cpu_record import cpu_s_of_tree
 from tests.plugins.draw import drawn
+from tests.support.suite.marks import costs_of, disagreements, remarked, settled
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = "[pytest]\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
@@ -28,7 +28,8 @@ def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() ->
     marks = re.compile(r"mark\.(slow|realtime|packages|whole|sweep)\b")
     files = [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
     assert [str(path.relative_to(ROOT)) for path in files if marks.search(path.read_text())] == [
-        "tests/browser/conftest.py"
+        "tests/browser/conftest.py",
+        "tests/support/suite/marks.py",  # sets the marks
     ]
 
 

@@ -50,6 +50,7 @@ SERVICE = {
 # The tests and their helpers that may: they are about processes, wires and machines outside the test's.
 TESTS = {
     "tests/support/arms": "drivers and simulators of arms go by the host's clock",
+    "tests/support/boards/arm_errors.py": "measures how long a calibration took, which a benchmark reports",
     "tests/support/pages/browser.py": "a browser goes by the host's clock",
     "tests/support/pages/certificates.py": "certificates hold for the host's time",
     "tests/support/record/time_stamp_authority.py": "certificates hold for the host's time",

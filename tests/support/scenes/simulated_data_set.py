@@ -24,7 +24,7 @@ _POINTS = 2000  # of the scan, by which the sparse views are chosen
 
 
 def simulated_data_set(folder: Path) -> DataSet:
-    """The data set of a folder that `bench.scenes.render_scene` wrote; its world is the frame of the scan."""
+    """The data set of a folder that `render_scene` wrote; its world is the frame of the scan."""
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     T_scan_world = inverse(np.array(truth["T_world_scan"]))
     camera = CameraModel.from_record(json.loads((folder / "camera.json").read_text(encoding="utf-8")))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bench.motion.clock_world import Duration, Seen, World, above, allows, below
 from service.core.records.events import ServiceStarted, SignInRecorded
 from service.people.accounts import INVITATION_S
 from service.people.control import UNANSWERED_S, Control
@@ -11,6 +10,7 @@ from service.people.rows import SESSION_S
 from service.people.sessions import FIRST_WAIT_S
 from service.people.tries import failed_tries
 from service.web.security import TRIES_WINDOW_S, Limiter
+from tests.support.clocks.world import Duration, Seen, World, above, allows, below
 from tests.support.pages.web import password_of
 from tests.support.record.store import start_run
 

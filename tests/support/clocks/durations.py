@@ -13,7 +13,6 @@ import trimesh
 from psutil import boot_time
 from sqlalchemy import update
 
-from bench.motion.clock_world import Duration, Seen, World, above, allows, below
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
 from service.core.records.base import elapsed
 from service.core.records.events import OperatorAction, SessionStarted
@@ -39,6 +38,7 @@ from service.store.durable_effects import moment_of
 from service.store.records import NewJob
 from service.web.capture.media import live_view
 from service.web.site import Site
+from tests.support.clocks.world import Duration, Seen, World, above, allows, below
 from tests.support.record.store import enqueue, put_image, start_run
 from tests.support.rig.bench_rig import BenchRig, answer
 from tests.support.rig.card import photograph, put
