@@ -35,10 +35,10 @@ def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() ->
 
 def test_large_libraries_that_few_tests_need_are_imported_within_them() -> None:
     """Every worker collects every file, and would load them for nothing."""
-    large = "highdicom|libcst|mlcroissant|mutmut|pandas|scipy.stats|torch|transformers|bench.suite.mutants.places"
+    large = "highdicom|libcst|mlcroissant|mutmut|pandas|scipy.stats|torch|transformers|tests.support.mutants.places"
     at_the_top = re.compile(rf"(?m)^(?:from|import) (?:{large})\b.*")
     below = re.compile(r"(?m)^(?:@|def |class |[A-Z_]+(?: =|:))")  # what stands there may be a text with imports
-    read = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "bench/soak").glob("*.py")]
+    read = [path for path in (ROOT / "tests").rglob("*.py") if path != ROOT / "tests/support/mutants/places.py"]
     found = {str(path): at_the_top.findall(below.split(path.read_text(), maxsplit=1)[0]) for path in read}
     assert {path: lines for path, lines in found.items() if lines} == {}
 
