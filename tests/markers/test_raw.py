@@ -77,7 +77,7 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             assert done.answer.parameters.gamma == (1.0, 1.0)
             (tiff,) = done.artefacts
             assert (tiff.kind, tiff.media_type, tiff.original_name) == ("developed", "image/tiff", f"{name}.tif")
-            again = run("develop", viewpoint=name, raw=raw, jpeg=jpeg, parameters=done.answer.parameters.plain())
+            again = run("develop", viewpoint=name, raw=raw, jpeg=jpeg, parameters=asdict(done.answer.parameters))
             assert again.artefacts[0].sha256 == tiff.sha256, "a replay gives the same file"
             developed[name] = tiff.sha256
         search = {
