@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.machine import RESULTS, machine
-from bench.scenes import rendered
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
@@ -32,6 +31,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.pose_files import read_poses
 from service.core.geometry import inverse
+from tests.support.scenes.rendered_scene import rendered
 
 SCENES = ("scene01_1920_20", "scene01_4752_18", "scene01_9504_12")
 LIMIT_S = 0.15  # for the markers of a 60 MP image

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.machine import RESULTS, commit, machine
-from bench.scenes import SETTINGS, plan_shots
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.develop import coded, develop
@@ -44,6 +43,7 @@ from simulators.scene.world import Scene
 from simulators.sony_camera.exif import PLATE
 from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
 from simulators.still_camera.raw_file import encode_raw
+from tests.support.scenes.rendered_scene import SETTINGS, plan_shots
 
 JPEG, RAW, NO_FILTERS = "JPEG", "developed raw file", "JPEG without colour filters"
 _TARGET_M = np.array([0.0, 0.0, 0.05])  # middle of the specimen, frame of the world

@@ -10,113 +10,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
 
-from bench.machine import REPOSITORY, RESULTS, commit, machine
-from bench.motion.clock_durations import RUN_DURATIONS
-from bench.motion.clock_people import PEOPLE_DURATIONS
-from bench.motion.clock_world import FAULTS, Row, rows_of
-
-DURATIONS = (*RUN_DURATIONS, *PEOPLE_DURATIONS)
-_LOOKS = re.compile(
-    r"utc_s\(|utc_now\(|fromisoformat|st_mtime|st_ctime|getmtime|[^_]elapsed\(|age_s\(|time\.time\(|julianday|"
-    r"_utc_s\b|boot_time"
-)
-_STAMP = "a time that is recorded, named or shown; nothing is judged by it"
-_FIGURE = "an estimate or a figure for people; it is never negative, and nothing waits for it"
-_CHANGE = "whether a file has changed, by its time being another one"
-#: Every file that looks at UTC, at a file's time or at the boot's: the row that tries what it judges, or why not.
-PLACES = {
-    "drivers/dicom_folder/folder.py": _CHANGE,
-    "drivers/genicam/__init__.py": "released_images has nothing to leave out: each image was asked for",
-    "drivers/gphoto/camera.py": "the camera's clock against the host's at one exposure, which is shown",
-    "drivers/interfaces/camera.py": "a photograph of the step",
-    "drivers/meshes/export_watch.py": _CHANGE,
-    "drivers/meshes/mesh_file.py": _CHANGE,
-    "drivers/photo_watch.py": "a photograph of the step",
-    "drivers/photos/photo_file.py": "a photograph of the step",
-    "drivers/photos/photo_folder.py": _CHANGE,
-    "drivers/scan_folder.py": "the newest of several files, for a recording of devices",
-    "drivers/video.py": "released_images has nothing to leave out: each image was asked for",
-    "service/audit/background.py": _STAMP,
-    "service/audit/bundle/contents.py": _STAMP,
-    "service/audit/bundle/export.py": _STAMP,
-    "service/audit/export/exports.py": _STAMP,
-    "service/audit/record/starts.py": "by how much UTC was set between two starts of one boot, which is recorded",
-    "service/audit/report/blocks.py": _FIGURE,
-    "service/audit/runs/comparison.py": _FIGURE,
-    "service/audit/verify/verifications.py": _STAMP,
-    "service/benchmark/methods.py": "the newest of several files",
-    "service/cli/runs.py": "days that a person asks for",
-    "service/cli/doctor.py": _STAMP,
-    "service/cli/serve.py": _STAMP,
-    "service/compute/sfm/front_end.py": _CHANGE,
-    "service/core/clocks.py": "offsets of cameras' clocks within one process, which are shown",
-    "service/core/records/base.py": "age of the coat",
-    "service/core/run/expected.py": f"{_FIGURE}; {_STAMP}",
-    "service/core/text/words.py": _STAMP,
-    "service/core/gates/release.py": "by how much a result is late; that it is late follows from the run's state",
-    "service/monitor/alarm.py": _STAMP,
-    "service/monitor/figures.py": _FIGURE,
-    "service/monitor/reporter.py": "time in which a runner's main loop hangs",
-    "service/monitor/snapshot.py": "last word of a runner; a worker's sign of life",
-    "service/people/accounts.py": "life of a one-time link",
-    "service/people/control.py": "wait for a locked screen in control",
-    "service/people/tries.py": "tries of an address, service restarted",
-    "service/people/person.py": _STAMP,
-    "service/people/rows.py": _STAMP,
-    "service/people/sessions.py": "life of a sign-in",
-    "service/run_record.py": _FIGURE,
-    "service/runner/leave.py": "a confirmation, by both clocks; tests/recovery/test_confirmation_lapses.py",
-    "service/steps/held_camera.py": "a photograph of the step",
-    "service/steps/coats.py": "age of the coat",
-    "service/steps/kinds/scan_import.py": "an export of the step",
-    "service/steps/due_jobs.py": _FIGURE,
-    "service/store/durable_effects.py": "life of a sign-in; the clocks themselves",
-    "service/store/backup/backup.py": _STAMP,
-    "service/store/database/engine.py": _CHANGE,
-    "service/store/database/migrations/versions/0001_evidence.py": _STAMP,
-    "service/store/database/migrations/versions/0002_people_and_checkpoints.py": _STAMP,
-    "service/store/database/new_schema.py": _STAMP,
-    "service/store/database/tables.py": _STAMP,
-    "service/store/events.py": _STAMP,
-    "service/store/disk_space.py": "age of an unrecorded file",
-    "service/store/journal/findings.py": "names of columns",
-    "service/store/journal/rebuild.py": _STAMP,
-    "service/store/jobs.py": "job's lease, its worker died on another host",
-    "service/store/runs.py": "run's lease, its runner lives on another host",
-    "service/store/records.py": _STAMP,
-    "service/store/signatures/second_place.py": _STAMP,
-    "service/store/signatures/signing.py": _STAMP,
-    "service/store/signatures/timestamps.py": _STAMP,
-    "service/store/store.py": _STAMP,
-    "service/store/verification/chain_checks.py": "times that run backwards within a chain, which the audit notes",
-    "service/store/verification/people_checks.py": "recorded times that must agree",
-    "service/web/capture/media.py": "age of a frame of the live view",
-    "service/web/home/history.py": _STAMP,
-    "service/web/home/pages.py": "last word of a runner",
-    "service/web/site.py": "last word of a runner",
-    "service/web/page/charts.py": _STAMP,
-    "service/web/page/robot_banner.py": "last word of a runner",
-    "service/web/page/run_frame.py": "last word of a runner",
-    "service/web/people/account.py": _STAMP,
-    "service/web/people/administration.py": _STAMP,
-    "service/web/run/pages.py": "last word of a runner",
-    "service/worker/following.py": "by how much a result is late; that it is late follows from the run's state",
-}
-
-
-def places() -> set[str]:
-    """The files that look at UTC, at the time of a file or at that of the boot."""
-    sources = [path for top in ("service", "drivers") for path in (REPOSITORY / top).rglob("*.py")]
-    found = [path for path in sources if _LOOKS.search(path.read_text())]
-    own = REPOSITORY / "service" / "audit" / "verify" / "bundle_verifier.py"  # of a bundle, far from every host
-    return {str(path.relative_to(REPOSITORY)) for path in found if path != own}
+from bench.machine import RESULTS, commit, machine
+from tests.support.clocks.places import DURATIONS, PLACES, places
+from tests.support.clocks.world import FAULTS, Row, rows_of
 
 
 def table(rows: Iterable[Row]) -> str:

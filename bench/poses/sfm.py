@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
-from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import true_error_m
 from service.compute.hybrid.estimate import hybrid_poses
 from service.compute.markers.image_files import detect_all
@@ -29,6 +28,7 @@ from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.sfm.options import Effort, Mapper, options_for
 from service.core.geometry import Array, align_points, apply, inverse
+from tests.support.scenes.rendered_scene import CACHE, render_scene
 
 COLUMNS = (
     ("camera_rms_mm", "camera positions, aligned (mm)"),

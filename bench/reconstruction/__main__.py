@@ -14,12 +14,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS
-from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import CACHE, render_scene
 from service.benchmark.methods import method_named, methods
 from service.benchmark.records import SCENARIOS, read_results
 from service.benchmark.running import Trial, run_trial
 from service.benchmark.table import figure_png, table_markdown
+from tests.support.scenes.rendered_scene import CACHE, render_scene
+from tests.support.scenes.simulated_data_set import simulated_data_set
 
 WORK = REPOSITORY / "build" / "bench" / "reconstruction"
 

@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import CACHE, render_scene
 from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.compute.pixels.render import RayMesh
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm
 from service.dataset.records import DataSet
+from tests.support.scenes.rendered_scene import CACHE, render_scene
+from tests.support.scenes.simulated_data_set import simulated_data_set
 
 ANGLES_DEG = (60.0, 70.0, 75.0, 80.0, 87.0)  # between the surface's normal and the ray
 VIEWS = (1, 2, 4)

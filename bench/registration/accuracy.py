@@ -19,7 +19,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from bench.scenes import CACHE, render_scene
 from drivers.meshes.mesh_file import read_mesh_file
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
@@ -36,6 +35,7 @@ from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.sfm.options import Effort, Mapper, options_for
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse
+from tests.support.scenes.rendered_scene import CACHE, render_scene
 
 
 @dataclass(frozen=True, slots=True)

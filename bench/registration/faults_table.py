@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from bench.machine import RESULTS, commit, machine
-from bench.scenes import CACHE, render_image, render_scene
 from service.cli.main import app
 from service.core.geometry import apply
+from tests.support.scenes.rendered_scene import CACHE, render_image, render_scene
 
 _ASIDE = np.array([0.6, 0.7, -0.39]) / np.linalg.norm([0.6, 0.7, -0.39])
 _WIDTH = 1920  # for which lengths in pixels below are meant

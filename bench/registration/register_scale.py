@@ -23,13 +23,13 @@ import cv2
 import numpy as np
 
 from bench.machine import RESULTS, machine
-from bench.scenes import rendered
 from service.compute.images.photographs import read_image
 from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.pipeline import register_images
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.pose_files import read_poses
 from service.compute.scene import PosedImages, ScanSpheres
+from tests.support.scenes.rendered_scene import rendered
 
 FILES = (("scene01_9504_12", (16, 32, 64, 108)), ("scene01_1920_20", (250, 1000)))
 SOLVE_FROM = "scene01_1920_20"

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
 from bench.registration.identity import CAMERA
-from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, true_error_m
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.image_files import detect_all
@@ -34,6 +33,7 @@ from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.scene.world import RADIUS_M, Scene
+from tests.support.scenes.rendered_scene import CACHE, render_scene
 from tests.support.stated_errors import normalised_rms, sigma_components_m
 
 SOURCES = ("true", "disturbed", "smooth", "robot")

@@ -22,7 +22,7 @@ from pathlib import Path
 import coverage
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from bench.suite.mutants.recorder import functions
+from tests.support.mutants.recorder import functions
 
 PACKAGES = ("service", "drivers", "simulators")
 FAST = "not (slow or realtime or packages or whole or sweep)"

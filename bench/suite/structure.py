@@ -23,7 +23,7 @@ from pathlib import PurePosixPath
 from typing import TypeVar
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from bench.suite.dialect import PARTICIPLES, PREPOSITIONS, docstrings_of, first_word
+from tests.support.suite.dialect import PARTICIPLES, PREPOSITIONS, docstrings_of, first_word
 
 ROOMS = ("service", "drivers", "simulators", "bench", "tests")
 SHORT_LINES = 40  # a module below it is hardly a subject of its own

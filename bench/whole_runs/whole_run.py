@@ -17,13 +17,13 @@ from typing import Any
 import psutil
 
 from bench.machine import REPOSITORY
-from bench.whole_runs.run_figures import run_figures
 from service.cli.demo import true_errors_mm
 from service.core.records.events import RunReleased
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from tests.support.recorded.run_figures import run_figures
 
 SECOND_PERSON = "second person of the bench"
 _WATCH_S = 0.5

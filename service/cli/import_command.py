@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -41,7 +41,7 @@ from service.computations.evaluate import Row
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
-from service.core.records.import_list import FileRole, ImportedView, ImportList, PhotographRole
+from service.core.records.import_list import FileRole, ImportList, PhotographRole
 from service.core.units import megabytes
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import summarise
@@ -223,7 +223,7 @@ def listing_record(listing: ImportList) -> dict[str, object]:
 
 def _unread(listing: ImportList) -> dict[str, str]:
     """Return by file what could not be read of photographs that are imported all the same."""
-    return {v.photograph.path: str(v.camera["unread"]) for v in listing.views if "unread" in v.camera}
+    return {v.photograph.path: v.optics.unread for v in listing.views if v.optics.unread}
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,22 +243,23 @@ class _PhotographsOfRole:
 
 def _photographs(listing: ImportList, role: PhotographRole) -> _PhotographsOfRole:
     views = listing.of(role)
-    times = sorted(str(view.camera["exif_time"]) for view in views if view.camera.get("exif_time"))
+    stated = [view.optics for view in views]
+    times = sorted(optics.exif_time for optics in stated if optics.exif_time)
     return _PhotographsOfRole(
         count=len(views),
         raw_files=sum(len(view.raws) for view in views),
-        cameras=_stated(views, ("make", "model", "body_serial")),
-        lenses=_stated(views, ("lens", "lens_serial")),
-        focal_lengths_mm=sorted({v.camera["focal_length_mm"] for v in views if "focal_length_mm" in v.camera}),
-        sizes=sorted({f"{v.camera.get('width')} × {v.camera.get('height')}" for v in views}),
+        cameras=_distinct((optics.make, optics.model, optics.body_serial) for optics in stated),
+        lenses=_distinct((optics.lens, optics.lens_serial) for optics in stated),
+        focal_lengths_mm=sorted({optics.focal_length_mm for optics in stated if optics.focal_length_mm is not None}),
+        sizes=sorted({f"{optics.width} × {optics.height}" for optics in stated}),
         first=times[0] if times else "",
         last=times[-1] if times else "",
         bytes=sum(file.size_bytes for view in views for file in (view.photograph, *view.raws)),
     )
 
 
-def _stated(views: Sequence[ImportedView], names: Sequence[str]) -> list[str]:
-    texts = (" ".join(str(view.camera[name]) for name in names if name in view.camera) for view in views)
+def _distinct(stated: Iterable[tuple[str, ...]]) -> list[str]:
+    texts = (" ".join(filter(None, parts)) for parts in stated)
     return sorted({text or "not stated" for text in texts})
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from service.cli.exit_status import ExitStatus
 from service.core.loading import begin_loading, end_loading
 from service.core.shown_text import shown, shown_lines
 from service.logs.terminal import show_own_words_only
@@ -266,7 +267,7 @@ def main() -> None:
         app()
     except Exception:  # noqa: BLE001 - a fault of this program; its text may come from a device or a file
         sys.stderr.write(shown_lines(traceback.format_exc()))
-        sys.exit(1)
+        sys.exit(ExitStatus.FAILED)
 
 
 if __name__ == "__main__":

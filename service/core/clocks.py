@@ -10,7 +10,7 @@ from datetime import datetime, timedelta
 from statistics import fmean, stdev
 from typing import Literal
 
-from service.core.recorded_devices import RecordedReport, recorded_optics, recorded_report
+from service.core.recorded_devices import RecordedReport, recorded_report
 from service.core.records.events import DeviceOpened, Event, FurtherExposure, SessionStarted, ViewpointCaptured
 from service.core.text.words import counted
 
@@ -52,13 +52,13 @@ def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOff
     coarse_s = max(resolution for _, resolution in found) / math.sqrt(6)  # two rounded times, each r / sqrt(12)
     scatter_s = stdev(offsets) if len(offsets) > 1 else 0.0
     sigma_s = max(coarse_s, scatter_s) / math.sqrt(len(offsets))
-    unlike = any(recorded_optics(capture.camera).model != recorded_optics(one.camera).model for capture, one in pairs)
+    unlike = any(capture.optics.model != one.optics.model for capture, one in pairs)
     return ClockOffset(fmean(offsets), math.hypot(sigma_s, _UNLIKE_S if unlike else 0.0), len(offsets), unlike)
 
 
 def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[float, float] | None:
     """Return offset and resolution of the recorded times, in seconds."""
-    first, second = (_time(recorded_optics(camera).exif_time) for camera in (capture.camera, exposure.camera))
+    first, second = (_time(stated.optics.exif_time) for stated in (capture, exposure))
     if first is None or second is None or (first[0].tzinfo is None) != (second[0].tzinfo is None):
         return None
     stated_s = (second[0] - first[0]).total_seconds()
@@ -251,7 +251,7 @@ def _exif_offset_s(event: Event) -> float | None:
     payload = event.payload
     assert isinstance(payload, ViewpointCaptured)
     try:
-        stamp = datetime.strptime(recorded_optics(payload.camera).exif_time, "%Y:%m:%d %H:%M:%S.%f%z")
+        stamp = datetime.strptime(payload.optics.exif_time, "%Y:%m:%d %H:%M:%S.%f%z")
         recorded = datetime.fromisoformat(event.at_utc)
     except ValueError:
         return None

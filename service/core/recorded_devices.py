@@ -1,4 +1,4 @@
-"""What devices and photographs state about themselves: their identities, the camera bodies, what was exchanged. Pure.
+"""What devices state about themselves: their identities, the camera bodies, what was exchanged. Pure.
 
 Drivers of any version wrote these data, so every field may be missing; no value of another type is an error.
 """
@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal
 
 from service.core.records.events import DeviceOpened, DeviceTrouble, Event, OperatorAction, RecordedView
-
-Plain = Mapping[str, object]
+from service.core.records.optics import mapping_of, number_of, text_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,79 +43,28 @@ class RecordedReport:
     details: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedOptics:
-    """Camera, lens and settings as a photograph states them (the field `camera` of a View); "" or None: not given."""
-
-    model: str = ""
-    body_serial: str = ""
-    lens: str = ""
-    lens_serial: str = ""
-    focal_length_mm: float | None = None
-    aperture_f: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-    focus_mode: str = ""
-    focus_distance_m: float | None = None
-    width: int | None = None
-    height: int | None = None
-    exif_time: str = ""
-
-
 def recorded_identity(stated: object) -> RecordedIdentity:
     """Return the identity in a recorded DeviceReport; all fields are "" if there is none."""
-    fields = _mapping(stated)
+    fields = mapping_of(stated)
     return RecordedIdentity(
-        kind=_text(fields.get("kind")),
-        model=_text(fields.get("model")),
-        serial=_text(fields.get("serial")),
-        firmware=_text(fields.get("firmware")),
-        driver=_text(fields.get("driver")),
-        driver_version=_text(fields.get("driver_version")),
-        address=_text(fields.get("address")),
+        kind=text_of(fields.get("kind")),
+        model=text_of(fields.get("model")),
+        serial=text_of(fields.get("serial")),
+        firmware=text_of(fields.get("firmware")),
+        driver=text_of(fields.get("driver")),
+        driver_version=text_of(fields.get("driver_version")),
+        address=text_of(fields.get("address")),
     )
 
 
 def recorded_report(report: object) -> RecordedReport:
     """Return the `report` of a device_opened event."""
-    fields = _mapping(report)
+    fields = mapping_of(report)
     identity = recorded_identity(fields.get("identity"))
     stated = fields.get("clock") or ("uptime" if identity.kind == "robot" else "utc")
     clock = "uptime" if stated == "uptime" else "utc"
-    details = {name: str(value) for name, value in _mapping(fields.get("details")).items()}
-    return RecordedReport(identity, _number(fields.get("clock_offset_s")), clock, details)
-
-
-def recorded_optics(camera: object) -> RecordedOptics:
-    """Return the `camera` of a view's event. Zero stands for a number that the camera does not know."""
-    fields = _mapping(camera)
-    return RecordedOptics(
-        model=_text(fields.get("model")),
-        body_serial=_text(fields.get("body_serial")),
-        lens=_text(fields.get("lens")),
-        lens_serial=_text(fields.get("lens_serial")),
-        focal_length_mm=_number(fields.get("focal_length_mm")) or None,
-        aperture_f=_number(fields.get("aperture_f")) or None,
-        exposure_s=_number(fields.get("exposure_s")) or None,
-        iso=_number(fields.get("iso")) or None,
-        focus_mode=_text(fields.get("focus_mode")),
-        focus_distance_m=_number(fields.get("focus_distance_m")) or None,
-        width=int(_number(fields.get("width")) or 0) or None,
-        height=int(_number(fields.get("height")) or 0) or None,
-        exif_time=_text(fields.get("exif_time")),
-    )
-
-
-def _mapping(value: object) -> Plain:
-    return cast("Plain", value) if isinstance(value, Mapping) else {}
-
-
-def _text(value: object) -> str:
-    return "" if value is None else str(value)
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    details = {name: str(value) for name, value in mapping_of(fields.get("details")).items()}
+    return RecordedReport(identity, number_of(fields.get("clock_offset_s")), clock, details)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +115,7 @@ def bodies(events: Sequence[Event]) -> CameraBodies:
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
     views = (event.payload for event in events if isinstance(event.payload, RecordedView))
     identities = ((payload.device, recorded_report(payload.report).identity) for payload in opened)
-    return bodies_of(identities, (recorded_optics(view.camera).body_serial for view in views))
+    return bodies_of(identities, (view.optics.body_serial for view in views))
 
 
 def bodies_of(identities: Iterable[tuple[str, RecordedIdentity]], stated: Iterable[str]) -> CameraBodies:

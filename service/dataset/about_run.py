@@ -7,7 +7,7 @@ from typing import Any
 
 from service.core.gates.acceptance import accepted_gates
 from service.core.gates.verdict import BOUNDS_HOLD, describe, standing
-from service.core.recorded_devices import bodies, recorded_optics, recorded_report
+from service.core.recorded_devices import bodies, recorded_report
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.records.events import DeviceOpened
 from service.core.records.import_list import imported_sentence
@@ -137,7 +137,7 @@ def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:
 def _settings(summary: RunSummary) -> tuple[tuple[str, str], ...]:
     """Return the camera settings of the protocol, the lens as the photographs state it, and the spheres."""
     camera, spheres = summary.protocol.camera, summary.protocol.spheres
-    optics = [recorded_optics(view.camera) for view in summary.captures()]
+    optics = [view.optics for view in summary.captures()]
     lenses = dict.fromkeys(one.lens for one in optics if one.lens)
     lengths = dict.fromkeys(f"{one.focal_length_mm:g} mm" for one in optics if one.focal_length_mm)
     found = [("lens", ", ".join(lenses)), ("focal length", ", ".join(lengths))]

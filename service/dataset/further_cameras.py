@@ -13,8 +13,8 @@ from service.computations.records import Matrix
 from service.core.clocks import ClockOffset, clock_offset
 from service.core.geometry import Transform
 from service.core.protocol.models import Protocol
-from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import ArtefactRef, FurtherExposure, RecordedView, ViewpointCaptured
+from service.core.records.optics import RecordedOptics
 from service.core.run.state import RunState
 from service.core.units import mm, mrad
 from service.dataset.registrations import further_cameras
@@ -106,7 +106,7 @@ def known_further_cameras(
         KnownFurtherCamera(
             name=name,
             mounted=mine[-1][1].mounted,
-            optics=recorded_optics(mine[0][1].camera),
+            optics=mine[0][1].optics,
             calibration=mine[-1][1].calibration,
             images={viewpoint: exposure.artefacts[0] for viewpoint, exposure in mine},
             located=located.get(name),

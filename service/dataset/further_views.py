@@ -155,7 +155,7 @@ def _view(
         T_scan_camera=T_scan_outer @ T_outer_camera,
         from_first=by_outer if rigid else np.zeros((6, 6)),
         from_mount=by_mount,
-        taken=str(exposure.camera.get("exif_time") or ""),
+        taken=exposure.optics.exif_time,
     )
 
 

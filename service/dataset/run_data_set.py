@@ -65,7 +65,7 @@ def data_set_of(
     truth = summary.ground_truth()
     mesh = truth.mesh
     stated_errors = view_covariances(summary, own, registered, sorted(files))
-    taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
+    taken = {capture.viewpoint: capture.optics.exif_time for capture in summary.captures()}
     first = [
         _view(name, path, registered, stated_errors.covariance[name], taken[name])
         for name, (path, _) in sorted(files.items())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 
 from service.computations import develop, further_camera
@@ -28,11 +28,10 @@ class ExposureFiles:
 
 def developed(context: StepContext, exposures: Sequence[ExposureFiles]) -> dict[str, str]:
     """Return the developed raw file of each exposure of one camera, by viewpoint."""
-    parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
     requests = [
         JobRequest.of(
             develop.KIND,
-            develop.Arguments(viewpoint=one.viewpoint, raw=one.raw, jpeg=one.jpeg, parameters=parameters),
+            develop.Arguments(viewpoint=one.viewpoint, raw=one.raw, jpeg=one.jpeg, parameters=PARAMETERS),
         )
         for one in exposures
     ]

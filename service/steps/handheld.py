@@ -16,6 +16,7 @@ from service.core.gates.verdict import evaluate_gates
 from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
 from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import Record, ViewHeld
+from service.core.records.optics import RecordedOptics
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
 from service.steps.context import JobRequest, StepContext, StepOutcome
@@ -362,19 +363,18 @@ class Guide:
 
     def _enqueue(self, view: ViewHeld) -> None:
         wanted = wanted_settings(self.context)
-        camera = view.camera
+        stated = view.optics
         settings = ""
         if not view.verdicts["settings"]:
             settings = (
-                f"the camera was set to f/{camera['aperture_f']:g}, {camera['exposure_s']:.3g} s, "
-                f"ISO {camera['iso']}; "
+                f"the camera was set to {_settings(stated)}; "
                 f"required are f/{wanted.aperture_f:g}, {wanted.exposure_s:.3g} s, ISO {wanted.iso}"
             )
         image = {
             "viewpoint": view.viewpoint,
             "sha256": view.artefacts[0].sha256,
             "settings": settings,
-            "focal_mm": camera["focal_length_mm"],
+            "focal_mm": stated.focal_length_mm or 0.0,
         }
         state = self.context.evidence.state()
         step = self.context.step.id
@@ -421,6 +421,13 @@ class Guide:
 
     def _say(self, words: str) -> None:
         self.context.tell(f"next: {words}")
+
+
+def _settings(stated: RecordedOptics) -> str:
+    """Return the settings of a photograph as a person reads them, and those that it does not state."""
+    aperture = "an unknown aperture" if stated.aperture_f is None else f"f/{stated.aperture_f:g}"
+    time = "an unknown time" if stated.exposure_s is None else f"{stated.exposure_s:.3g} s"
+    return f"{aperture}, {time}, {'an unknown ISO' if stated.iso is None else f'ISO {stated.iso:g}'}"
 
 
 def _answer_of(job: JobState) -> hand_view.Answer:

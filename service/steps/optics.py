@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from pydantic import BaseModel
 
@@ -11,11 +10,6 @@ from service.compute.intrinsics.optics import Optics, OpticsDeparture, compare_o
 from service.core.records.events import RecordedView
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING
-
-_STATED = (
-    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "focus_position", "lens",
-    "lens_serial", "body_serial",
-)  # fmt: skip
 
 
 def optics_departures(
@@ -79,11 +73,17 @@ def _calibration_images(context: StepContext) -> tuple[RecordedView, ...]:
 
 
 def _optics(capture: RecordedView) -> Optics:
-    record = capture.camera
-    return Optics(image=capture.viewpoint, **{name: record[name] for name in _STATED if _stated(name, record)})
-
-
-def _stated(name: str, record: Mapping[str, Any]) -> bool:
-    """Return whether the image has a value: 0 is a position of the focus motor, but means "unknown" elsewhere."""
-    value = record.get(name)
-    return value is not None if name == "focus_position" else bool(value)
+    stated = capture.optics
+    return Optics(
+        image=capture.viewpoint,
+        width=stated.width,
+        height=stated.height,
+        focal_length_mm=stated.focal_length_mm,
+        aperture_f=stated.aperture_f,
+        focus_distance_m=stated.focus_distance_m,
+        focus_mode=stated.focus_mode,
+        focus_position=stated.focus_position,
+        lens=stated.lens,
+        lens_serial=stated.lens_serial,
+        body_serial=stated.body_serial,
+    )

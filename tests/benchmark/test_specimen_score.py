@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from bench.reconstruction.specimen import score_specimen, specimen_of
 from service.compute.ground_truth.fuse import Markers
 from service.compute.ground_truth.surface import Surface, write_ply
 from service.dataset.records import Mesh
+from tests.support.scenes.specimen import score_specimen, specimen_of
 
 CENTRE_M = np.array([0.0, 0.0, 0.03])
 UP = np.array([0.0, 0.0, 1.0])

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import render_scene
 from service.benchmark.methods import methods
 from service.benchmark.running import Trial, run_trial
 from service.compute.ground_truth.chamfer import ChamferSettings
+from tests.support.scenes.rendered_scene import render_scene
+from tests.support.scenes.simulated_data_set import simulated_data_set
 
 SCENE, WIDTH_PX, VIEWS = 7, 1280, 16
 

@@ -12,8 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from bench.calibration.arm_errors import one as hand_eye_of
-from bench.calibration.arm_errors import seen_from_nominal_flange
 from service.cli.calibrate import calibrate_app
 from service.computations import records
 from service.computations.conversion import arm_correction_record, corrected_mounting, hand_eye_record
@@ -41,6 +39,7 @@ from simulators.scene.factory_calibrations import CALIBRATIONS, draw_departures
 from simulators.scene.world import Scene
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.kinematics import forward as simulated_forward
+from tests.support.boards.arm_errors import hand_eye_of, seen_from_nominal_flange
 from tests.support.boards.board_images import checkerboard, photograph
 from tests.support.boards.board_sessions import (
     BOARD,

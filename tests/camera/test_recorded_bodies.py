@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.cameras.listings import transcribe
 from drivers.errors import DeviceRefusedError, DeviceStorageFullError, DeviceTimeoutError
 from drivers.gphoto.profile import battery_fraction
 from drivers.gphoto.profiles import profile_for
@@ -20,6 +19,7 @@ from drivers.interfaces import CameraSettings
 from simulators.rig.cameras import as_recorded
 from simulators.sony_camera.answers import HOWS
 from simulators.sony_camera.recorded import names, recorded_table
+from tests.support.recorded.listings import transcribe
 from tests.support.rig.gphoto_rig import PAPER, gphoto_rig
 from tests.support.vendor.camera_vendor_session import vendor_session
 

@@ -9,9 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from bench.suite.dialect import FOLDERS, LIST, TICS, places_in
 from tests.support.rig.rig import REPOSITORY
+from tests.support.suite.dialect import FOLDERS, TICS, places_in
 
+SCRIPT = ("bench/__init__.py", "bench/machine.py", "bench/suite/dialect.py", "tests/support/suite/dialect.py")
 SOURCE = '''"""A module."""
 
 
@@ -56,8 +57,8 @@ def test_each_turn_of_phrase_is_found_with_its_line(tmp_path: Path) -> None:
 
 def test_the_check_fails_when_a_count_rises_and_the_list_follows_what_falls(tmp_path: Path) -> None:
     tree_with(tmp_path, SOURCE)
-    (tmp_path / "bench" / "suite").mkdir()
-    for name in ("bench/__init__.py", "bench/machine.py", "bench/suite/__init__.py", "bench/suite/dialect.py"):
+    for name in SCRIPT:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(REPOSITORY / name, tmp_path / name)
 
     def dialect(*words: str) -> subprocess.CompletedProcess[str]:
@@ -83,5 +84,5 @@ def test_the_check_fails_when_a_count_rises_and_the_list_follows_what_falls(tmp_
 
 
 def test_the_list_of_the_repository_names_every_turn_and_every_folder() -> None:
-    listed = json.loads(LIST.read_text(encoding="utf-8"))
+    listed = json.loads((REPOSITORY / "bench/suite/dialect.json").read_text(encoding="utf-8"))
     assert {tic: set(rooms) for tic, rooms in listed.items()} == {tic: set(FOLDERS) for tic in TICS}

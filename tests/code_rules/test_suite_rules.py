@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from bench.suite.marks import costs_of, disagreements, remarked, settled
 from tests.plugins.collecting import dearest_first, is_compiled
 from tests.plugins.cost_limit import CostLimit
 from tests.plugins.cpu_record import cpu_s_of_tree
 from tests.plugins.draw import drawn
+from tests.support.suite.marks import costs_of, disagreements, remarked, settled
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = "[pytest]\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
@@ -28,16 +28,17 @@ def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() ->
     marks = re.compile(r"mark\.(slow|realtime|packages|whole|sweep)\b")
     files = [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
     assert [str(path.relative_to(ROOT)) for path in files if marks.search(path.read_text())] == [
-        "tests/browser/conftest.py"
+        "tests/browser/conftest.py",
+        "tests/support/suite/marks.py",  # sets the marks
     ]
 
 
 def test_large_libraries_that_few_tests_need_are_imported_within_them() -> None:
     """Every worker collects every file, and would load them for nothing."""
-    large = "highdicom|libcst|mlcroissant|mutmut|pandas|scipy.stats|torch|transformers|bench.suite.mutants.places"
+    large = "highdicom|libcst|mlcroissant|mutmut|pandas|scipy.stats|torch|transformers|tests.support.mutants.places"
     at_the_top = re.compile(rf"(?m)^(?:from|import) (?:{large})\b.*")
     below = re.compile(r"(?m)^(?:@|def |class |[A-Z_]+(?: =|:))")  # what stands there may be a text with imports
-    read = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "bench/soak").glob("*.py")]
+    read = [path for path in (ROOT / "tests").rglob("*.py") if path != ROOT / "tests/support/mutants/places.py"]
     found = {str(path): at_the_top.findall(below.split(path.read_text(), maxsplit=1)[0]) for path in read}
     assert {path: lines for path, lines in found.items() if lines} == {}
 

@@ -50,12 +50,15 @@ SERVICE = {
 # The tests and their helpers that may: they are about processes, wires and machines outside the test's.
 TESTS = {
     "tests/support/arms": "drivers and simulators of arms go by the host's clock",
+    "tests/support/boards/arm_errors.py": "measures how long a calibration took, which a benchmark reports",
     "tests/support/pages/browser.py": "a browser goes by the host's clock",
     "tests/support/pages/technician.py": "a browser goes by the host's clock",
     "tests/support/pages/certificates.py": "certificates hold for the host's time",
     "tests/support/record/time_stamp_authority.py": "certificates hold for the host's time",
+    "tests/support/mutants/trial.py": "ends a child process that takes too long",
     "tests/support/processes": "other processes go by the host's clock; until() is how a test waits for one",
-    "tests/support/soak/fit.py": "measures durations, which a benchmark reports",
+    "tests/support/soak": "measures durations, which a benchmark reports, of programs that go by the host's clock",
+    "tests/support/torture": "drivers, parsers and stores in processes of their own go by the host's clock",
     "tests/support/vendor": "other programs, which drive simulators in real time",
     "tests/support/rig/host_fake_driver.py": "runs in the driver's process",
     "tests/support/rig/world_watch.py": "looks at a simulator in real time",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from bench.motion.clock_faults import DURATIONS, PLACES, places
-from bench.motion.clock_world import FAULTS, Fault, rows_of
+from tests.support.clocks.places import DURATIONS, PLACES, places
+from tests.support.clocks.world import FAULTS, Fault, rows_of
 
 _QUICK = ("age of the coat", "last word of a runner", "age of an unrecorded file", "life of a sign-in")
 

@@ -20,13 +20,14 @@ from service.core.errors import DataError
 from service.core.protocol.models import load_protocol
 from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
 from service.core.records.import_list import FileRole, PhotographRole
+from service.core.records.optics import RecordedOptics
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import summarise
 from service.import_folder import CtReading, find_places, import_rig, list_import
 from service.run_start import recorded_rig, recorded_run, start_run
 from service.steps import params_models
-from service.steps.kinds.image_import import StatedSettings, stated_settings_agree
+from service.steps.kinds.image_import import stated_settings_agree
 from service.store.database.engine import database_path
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -192,10 +193,10 @@ def test_a_dry_run_shows_and_records_nothing(folder: Path, tmp_path: Path) -> No
 
 def test_settings_are_judged_where_protocol_and_file_state_them() -> None:
     wanted = load_protocol(REPOSITORY / "protocols" / "demo.yaml", params_models()).protocol.camera
-    assert stated_settings_agree(StatedSettings(aperture_f=22.0, exposure_s=1 / 15, iso=100), wanted) is True
-    assert stated_settings_agree(StatedSettings(aperture_f=8.0), wanted) is False
-    assert stated_settings_agree(StatedSettings(), wanted) is None
-    assert stated_settings_agree(StatedSettings(aperture_f=8.0), None) is None
+    assert stated_settings_agree(RecordedOptics(aperture_f=22.0, exposure_s=1 / 15, iso=100), wanted) is True
+    assert stated_settings_agree(RecordedOptics(aperture_f=8.0), wanted) is False
+    assert stated_settings_agree(RecordedOptics(), wanted) is None
+    assert stated_settings_agree(RecordedOptics(aperture_f=8.0), None) is None
 
 
 def test_the_list_is_the_rig_of_the_run_and_names_the_interrupted_one(folder: Path, tmp_path: Path) -> None:

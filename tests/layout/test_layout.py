@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from bench.registration.layout_gate import judge
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import REQUIRED_MARGIN_M, check_layout
@@ -26,6 +25,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse, transform
 from simulators.rig.world_server import HELD_CAMERAS
 from simulators.scene.world import Scene
+from tests.support.scenes.judged_layout import judge
 
 
 def _decagon(height_m: float = 0.0) -> Array:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bench.markers.detectors import main
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.grounded import LAST_THRESHOLD, GroundedDetector, find_boxes, normalised, tiles_of, voted
 from service.compute.markers.grounded_networks import (
@@ -26,6 +28,7 @@ from service.compute.markers.grounded_networks import (
 )
 from service.core.errors import ConfigurationError, DataError
 from tests.support.grounded_weights import tiny_weights
+from tests.support.rig.rig import REPOSITORY
 from tests.support.scenes.sphere_images import CONTROL_M, REGISTRATION_M, exact_outlines, render, scene
 
 EVERY = np.vstack([REGISTRATION_M, CONTROL_M])
@@ -206,13 +209,10 @@ def test_a_vote_keeps_what_both_find_and_what_one_finds_clearly() -> None:
 
 @needs_torch
 @pytest.mark.slow
-def test_all_detectors_are_measured_side_by_side(
-    tiny: Weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(VARIABLE, str(tiny.folder))
+def test_all_detectors_are_measured_side_by_side(tiny: Weights, tmp_path: Path) -> None:
     size = ("--images", "1", "--width", "400", "--only", "behind tissue", "--out", str(tmp_path))
-    monkeypatch.setattr("sys.argv", ["detectors", *size])
-    main()
+    command = [sys.executable, "-m", "bench.markers.detectors", *size]
+    subprocess.run(command, cwd=REPOSITORY, env={**os.environ, VARIABLE: str(tiny.folder)}, check=True)
     (table,) = tmp_path.glob("detectors-*.md")
     rows = [line.split("|")[2].strip() for line in table.read_text().splitlines() if line.startswith("| green")]
     assert rows == ["classical", "paper", "grounded", "vote"]

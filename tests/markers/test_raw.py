@@ -79,7 +79,7 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             assert (tiff.kind, tiff.media_type, tiff.original_name) == ("developed", "image/tiff", f"{name}.tif")
             developed[name] = tiff.sha256
             if number == 0:
-                again = run("develop", viewpoint=name, raw=raw, jpeg=jpeg, parameters=done.answer.parameters.plain())
+                again = run("develop", viewpoint=name, raw=raw, jpeg=jpeg, parameters=asdict(done.answer.parameters))
                 assert again.artefacts[0].sha256 == tiff.sha256, "a replay gives the same file"
         search = {
             "images": views, "camera": asdict(camera), "spheres_m": scene.registration_m.tolist(),

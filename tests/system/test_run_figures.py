@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bench.whole_runs.run_figures import run_figures
 from service.core.protocol.models import load_protocol
 from service.dataset.summary import summarise
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.protocols.shortened import shortened
+from tests.support.recorded.run_figures import run_figures
 from tests.support.rig.rig import REPOSITORY
 from tests.support.runs.bench_run import record_runs
 

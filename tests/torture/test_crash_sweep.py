@@ -31,10 +31,10 @@ KINDS = [
     for how in ("kill", "power")
 ]
 FORGETFUL = """
-from bench.torture.crash.__main__ import main
+import runpy
 from tests.support.processes.mortal_files import MortalFiles
 MortalFiles.sync_file = lambda _self, _path: None  # a store that writes and renames, and does not sync
-main()
+runpy.run_module("bench.torture.crash", run_name="__main__")
 """
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.machine import REPOSITORY
-from bench.suite.mutants.reach import RECORD, Reach, digest, files_of_tests
-from bench.suite.mutants.recorder import functions
-from bench.suite.mutants.subjects import SUBJECTS, TESTS
-from bench.suite.mutants.trial import Trial, copied_tree
+from tests.support.mutants.reach import RECORD, Reach, digest, files_of_tests
+from tests.support.mutants.recorder import functions
+from tests.support.mutants.subjects import SUBJECTS, TESTS
+from tests.support.mutants.trial import Trial, copied_tree
+from tests.support.rig.rig import REPOSITORY
 
 MODULE = '''"""Words."""
 
@@ -66,7 +66,7 @@ GATES = "service/core/gates/made_up.py"
 
 def changes(folder: Path) -> dict[str, set[tuple[str, str]]]:
     """What the lines of the module become, by kind."""
-    from bench.suite.mutants.places import mutated, places  # noqa: PLC0415 - loads libcst: a second in every worker
+    from tests.support.mutants.places import mutated, places  # noqa: PLC0415 - loads libcst: a second in every worker
 
     made = [mutated(folder, place) for place in places(folder, "gates", GATES)]
     found: dict[str, set[tuple[str, str]]] = {}
@@ -99,7 +99,7 @@ def test_what_no_result_depends_on_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_the_seed_alone_decides_and_no_subject_comes_short(tmp_path: Path) -> None:
-    from bench.suite.mutants.places import drawn  # noqa: PLC0415 - loads libcst
+    from tests.support.mutants.places import drawn  # noqa: PLC0415 - loads libcst
 
     folder = tree(tmp_path)
     first, again, other = (drawn(folder, seed, 24) for seed in ("1", "1", "2"))
@@ -147,7 +147,7 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
     tmp_path: Path, after: str, outcome: str
 ) -> None:
     """The file is longer or not, and of the same second: byte code of either text is never taken for the other."""
-    from bench.suite.mutants.places import Place, mutated  # noqa: PLC0415 - loads libcst
+    from tests.support.mutants.places import Place, mutated  # noqa: PLC0415 - loads libcst
 
     folder = tree(tmp_path)
     selected = recorded(folder, TEST).selected("gates", GATES, 18)
@@ -170,11 +170,11 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
 
 
 def test_a_copied_tree_need_not_be_compiled_again(tmp_path: Path) -> None:
-    module = "bench/suite/mutants/subjects.py"
+    module = "tests/support/mutants/subjects.py"
     py_compile.compile(str(REPOSITORY / module))
     copied = copied_tree(tmp_path / "tree", None)
     shown = subprocess.run(
-        [sys.executable, "-v", "-c", "import bench.suite.mutants.subjects"],
+        [sys.executable, "-v", "-c", "import tests.support.mutants.subjects"],
         cwd=copied, env={**os.environ, "PYTHONPATH": str(copied)}, capture_output=True, text=True, check=True,
     ).stderr  # fmt: skip
     assert re.search(rf"subjects\S*\.pyc matches {re.escape(str(copied / module))}", shown)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from bench.torture.audit.__main__ import DOCUMENT, SWEEPS, documented_codes, main, problems
-from bench.torture.audit.tally import Tally
+from tests.support.rig.rig import REPOSITORY
+from tests.support.torture.audit.documented import DOCUMENT, SWEEPS, documented_codes, problems
+from tests.support.torture.audit.tally import Tally
 
 #: Kinds of change, by sweep, of which sixty always hold some that are told.
 TOLD = {
@@ -30,7 +33,9 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("sweep", SWEEPS)
 def test_what_is_altered_is_told_with_its_place_or_documented(sweep: str, work: Path, tmp_path: Path) -> None:
     words = ["--only", sweep, "--sample", "60", "--seed", "5", "--work", str(work), "--results", str(tmp_path)]
-    assert main(words) == 0
+    command = [sys.executable, "-m", "bench.torture.audit", *words]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
     (found,) = tmp_path.glob("torture_audit-*.json")
     about = json.loads(found.read_text())
     assert about["problems"] == []

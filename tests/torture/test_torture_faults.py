@@ -15,16 +15,15 @@ from typing import Any
 
 import pytest
 
-from bench.torture.faults.__main__ import DOCUMENT
-from bench.torture.faults.judgement import rules
-from bench.torture.faults.judgement.table import Row, differences, read_table, report, table
-from bench.torture.faults.judgement.verdict import Verdict, masked
-from bench.torture.faults.matrix import COLUMNS, cases
-from bench.torture.faults.place.person import Motions
 from service.store.store import Store
 from tests.support.rig.rig import REPOSITORY
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 from tests.support.runs.drawn_rows import rows_to_run
+from tests.support.torture.faults.judgement import rules
+from tests.support.torture.faults.judgement.table import DOCUMENT, Row, differences, read_table, report, table
+from tests.support.torture.faults.judgement.verdict import Verdict, masked
+from tests.support.torture.faults.matrix import COLUMNS, cases
+from tests.support.torture.faults.place.person import Motions
 
 # One case of each device that ends the same way on any machine; for the robot also one of its own faults.
 CHOSEN = (
@@ -40,11 +39,10 @@ CHOSEN = (
     "store/disk_full/commit_02",
 )
 SILENT = """
-import sys
+import runpy
 import service.store.database.engine as database
-from bench.torture.faults.__main__ import main
 database._advise = lambda _error: ""  # a store that says what is wrong, and not what to do
-sys.exit(main())
+runpy.run_module("bench.torture.faults", run_name="__main__")
 """
 
 

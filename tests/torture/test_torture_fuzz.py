@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.torture.fuzz.targets.table import GROUPS, targets_of
-from bench.torture.fuzz.targets.target import fault_of
-from bench.torture.fuzz.watch import Sweep
 from drivers.errors import UnreadableFileError
 from drivers.meshes.surface_file import read_surface_file
 from service.compute.images.photographs import read_image
 from service.core.errors import DataError
+from tests.support.torture.fuzz.targets.table import GROUPS, targets_of
+from tests.support.torture.fuzz.targets.target import fault_of
+from tests.support.torture.fuzz.watch import Sweep
 
 PARSERS = "tests.support.processes.faulty_parsers"
 FOUND = Path(__file__).parents[1] / "data" / "fuzz"  # by target: inputs that once showed a fault

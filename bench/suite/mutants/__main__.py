@@ -27,11 +27,11 @@ from typing import Any
 import yaml
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from bench.suite.mutants.places import Mutation, drawn
-from bench.suite.mutants.reach import Reach
 from bench.suite.mutants.record import record_reach
-from bench.suite.mutants.subjects import SUBJECTS
-from bench.suite.mutants.trial import Trial, Verdict, copied_tree, import_libraries
+from tests.support.mutants.places import Mutation, drawn
+from tests.support.mutants.reach import Reach
+from tests.support.mutants.subjects import SUBJECTS
+from tests.support.mutants.trial import Trial, Verdict, copied_tree, import_libraries
 
 EQUIVALENT = Path(__file__).with_name("equivalent.yaml")
 MEMORY, ROOM_BYTES = Path("/dev/shm"), 2 * 2**30

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from bench.machine import REPOSITORY
-from bench.suite.mutants.reach import RECORD, digest, files_of_tests
-from bench.suite.mutants.recorder import TARGET
-from bench.suite.mutants.trial import CHOSEN, copied_tree
+from tests.support.mutants.reach import RECORD, digest, files_of_tests
+from tests.support.mutants.recorder import TARGET
+from tests.support.mutants.trial import CHOSEN, copied_tree
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def record_reach(folder: Path) -> None:
     told = folder / "told.json"
     words = [
         *(sys.executable, "-m", "pytest", "-q", "-o", "addopts=", "--strict-markers", "--import-mode=importlib"),
-        *("-p", "bench.suite.mutants.recorder", "-p", "no:cacheprovider", *CHOSEN),
+        *("-p", "tests.support.mutants.recorder", "-p", "no:cacheprovider", *CHOSEN),
         *("--basetemp", str(folder / "tmp"), *changed),
     ]
     path = os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])

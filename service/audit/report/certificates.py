@@ -40,8 +40,8 @@ from service.computations.calibrate.records import (
 from service.computations.records import Camera
 from service.core.gates.acceptance import depends_on
 from service.core.geometry import Array
-from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import RecordedView
+from service.core.records.optics import RecordedOptics
 from service.core.units import mm
 
 _WIDTH = 480.0
@@ -213,7 +213,7 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
 def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer) -> DescriptionList:
     state = run.state.steps[step_id]
     first = next((run.events[seq - 1].payload for seq in sorted(state.captured.values())), None)
-    camera = recorded_optics(first.camera if isinstance(first, RecordedView) else {})
+    camera = first.optics if isinstance(first, RecordedView) else RecordedOptics()
     rows: list[tuple[str, TableCell | str]] = [
         ("Certificate number (SHA-256 of calibration.json)", sha256),
         ("Calibrated", utc(state.ended_utc) if state.ended_utc else "not accepted yet"),

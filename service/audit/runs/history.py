@@ -14,7 +14,8 @@ from sqlalchemy import Connection, text
 from service.audit.filters import RunSearch
 from service.audit.record.rows import plain_payload
 from service.audit.runs.search import FoundRun, find_runs
-from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_identity, recorded_optics
+from service.core.recorded_devices import RecordedIdentity, recorded_identity
+from service.core.records.optics import RecordedOptics, recorded_optics
 from service.store.store import Store
 
 InstrumentKind = Literal["camera", "lens", "arm"]

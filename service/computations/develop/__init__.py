@@ -4,20 +4,7 @@ from __future__ import annotations
 
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import Hash
-
-
-class Parameters(JobRecord):
-    """The development parameters: the fields of DevelopParameters (service/compute/images/develop_parameters.py)."""
-
-    demosaic: str
-    white_balance: str
-    primaries: str
-    gamma: tuple[float, float]
-    highlights: str
-    auto_brightness: bool
-    noise_reduction: bool
-    orientation: int
-    bits: int
+from service.compute.images.develop_parameters import Crop, DevelopParameters
 
 
 class Arguments(JobRecord):
@@ -26,17 +13,7 @@ class Arguments(JobRecord):
     viewpoint: str
     raw: Hash
     jpeg: Hash
-    parameters: Parameters
-
-
-class Crop(JobRecord):
-    """The JPEG's part of the developed area, in pixels, and where it comes from: `file`, `moved` or `matched`."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-    found: str
+    parameters: DevelopParameters
 
 
 class Answer(JobRecord):
@@ -57,7 +34,7 @@ class Answer(JobRecord):
     """
 
     raw: Hash
-    parameters: Parameters
+    parameters: DevelopParameters
     white_balance: tuple[float, ...]
     black_level: tuple[int, ...]
     white_level: int

@@ -42,8 +42,7 @@ def develop_raw(context: JobContext[job.Arguments]) -> JobAnswer:
     """Develop the raw file of a job with the recorded parameters."""
     cv2.setNumThreads(1)
     arguments = context.arguments
-    parameters = DevelopParameters(**arguments.parameters.model_dump())
-    made = develop_file(context.input(arguments.raw), context.input(arguments.jpeg), parameters)
+    made = develop_file(context.input(arguments.raw), context.input(arguments.jpeg), arguments.parameters)
     tiff = context.keep_bytes(made.tiff, kind="developed", media_type="image/tiff", name=f"{arguments.viewpoint}.tif")
     answer = job.Answer.model_validate({**asdict(made.how), "raw": arguments.raw})
     return JobAnswer({"largest_shift_px": made.how.largest_shift_px or 0.0}, (tiff,), answer)

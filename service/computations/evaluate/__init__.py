@@ -9,6 +9,7 @@ from pydantic import Field
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import PosedPhotograph, SpheresFound
 from service.computations.register import Registration
+from service.compute.evaluation.control_sphere import ControlSphere
 from service.machine.resources import IMAGE_MB, processes_for
 
 
@@ -22,30 +23,6 @@ class Arguments(JobRecord):
     ct: SpheresFound | None = None
     radius_m: float
     colour: str | None = None
-
-
-class ControlSphere(JobRecord):
-    """The error of a registration at one control sphere.
-
-    Attributes:
-        index: its number in the list of control spheres, from 0.
-        expected: number of images that should show it.
-        measured: number of images in which it was measured.
-        radial_error_mm: the mean over its outlines; None if it was not measured.
-        reprojection_error_px: the mean over its outlines.
-        displacement_mm: the distance from where scan and registration put it to where the images see it.
-        displacement_sigma_mm: the standard deviation of the displacement, as far as the outlines determine it.
-        finding: a sentence on what is wrong; empty if nothing is.
-    """
-
-    index: int
-    expected: int
-    measured: int
-    radial_error_mm: float | None = None
-    reprojection_error_px: float | None = None
-    displacement_mm: float | None = None
-    displacement_sigma_mm: float | None = None
-    finding: str = ""
 
 
 class Row(JobRecord):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
@@ -149,7 +149,7 @@ def _row(registered: _Registered, budget: ErrorBudget, errors: _Errors) -> job.R
         mean_reprojection_error_px=errors.mean_reprojection_px,
         evaluated_on=errors.evaluated_on,
         control_outlines=errors.control_outlines,
-        control_spheres=tuple(job.ControlSphere(**asdict(sphere)) for sphere in registered.controls.spheres),
+        control_spheres=registered.controls.spheres,
     )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from service.compute.evaluation.accuracy import Evaluation, evaluate
+from service.compute.evaluation.control_sphere import ControlSphere
 from service.compute.evaluation.error_budget import TriangulatedSphere, locate_in_images
 from service.compute.markers.cones import Cone
 from service.compute.markers.predicted import CLEARLY_VISIBLE, is_another, visible_cones
@@ -29,37 +30,6 @@ _SIGMAS, _LEAST_DISPLACEMENT_M = 5.0, 0.3e-3  # from which a displacement is rep
 ExpectedNearby = Sequence[tuple[int, Sequence[tuple[Cone, float]]]]
 #: Searches images around expected cones, as `find_nearby` does, and gives the outlines in each.
 SearchNearby = Callable[[ExpectedNearby], Sequence[Sequence[SphereOutline]]]
-
-
-@dataclass(frozen=True, slots=True)
-class ControlSphere:
-    """The evaluation of one control sphere.
-
-    Attributes:
-        index: its index in the list of control spheres.
-        expected: number of images that should show it.
-        measured: number of images in which it was measured.
-        radial_error_mm: mean radial error over its outlines; None if it was not measured.
-        reprojection_error_px: mean reprojection error over its outlines.
-        displacement_mm: distance from where scan and registration put it to where the images see it; None below three
-            images.
-        displacement_sigma_mm: standard deviation of the displacement, as far as the outlines determine it.
-        finding: the fault, and the remedy; "" if there is none.
-    """
-
-    index: int
-    expected: int
-    measured: int
-    radial_error_mm: float | None = None
-    reprojection_error_px: float | None = None
-    displacement_mm: float | None = None
-    displacement_sigma_mm: float | None = None
-    finding: str = ""
-
-    @property
-    def share(self) -> float:
-        """Share of the expected outlines that were measured, 1 if none was expected."""
-        return min(1.0, self.measured / self.expected) if self.expected else 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from service.compute.descent import gauss_newton
-from service.compute.images.develop_parameters import PARAMETERS, DevelopParameters
+from service.compute.images.develop_parameters import PARAMETERS, Crop, DevelopParameters
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 
@@ -25,21 +25,6 @@ MOST_SHIFT_PX = 0.25  # of the developed picture against the JPEG; half a pixel 
 _MOST_ROOM_PX = 160  # around the JPEG in the exposed area; cameras leave out some tens of pixels
 _TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE,
          cv2.IMWRITE_TIFF_PREDICTOR, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL]  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Crop:
-    """The part of the developed area that the JPEG shows, in pixels of that area.
-
-    `found` says where it comes from: `file`: the raw file names it; `moved`: the file names another, and the JPEG
-    shows this one; `matched`: the file names none of the JPEG's size, so it was found by comparison with the JPEG.
-    """
-
-    left: int
-    top: int
-    width: int
-    height: int
-    found: str
 
 
 @dataclass(frozen=True, slots=True)

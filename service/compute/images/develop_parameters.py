@@ -1,4 +1,4 @@
-"""The fixed parameters with which raw files are developed; read by steps, which load no image library."""
+"""How raw files are developed: the fixed parameters, and the part that is cut out. Loads no image library."""
 
 from __future__ import annotations
 
@@ -34,3 +34,18 @@ class DevelopParameters:
 
 
 PARAMETERS = DevelopParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """The part of the developed area that the JPEG shows, in pixels of that area.
+
+    `found` says where it comes from: `file`: the raw file names it; `moved`: the file names another, and the JPEG
+    shows this one; `matched`: the file names none of the JPEG's size, so it was found by comparison with the JPEG.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    found: str

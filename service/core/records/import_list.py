@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from service.core.errors import DataError
 from service.core.records.events import Record
+from service.core.records.optics import RecordedOptics, recorded_optics
 
 PhotographRole = Literal["calibration", "image", "control_image"]
 FileRole = Literal["scan", "control_scan", "ct"]
@@ -28,7 +29,12 @@ class ImportedView(Record):
     role: PhotographRole
     photograph: ImportedFile
     raws: tuple[ImportedFile, ...] = ()
-    camera: dict[str, Any]
+    camera: dict[str, Any]  # as its EXIF states it; read by `optics`
+
+    @property
+    def optics(self) -> RecordedOptics:
+        """Return what the photograph states of its camera, lens and settings."""
+        return recorded_optics(self.camera)
 
 
 class LeftOutFile(Record):

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel
-
 from drivers.stated_settings import agrees
 from service.core.errors import ConfigurationError, DataError
 from service.core.protocol.models import CameraSection
 from service.core.protocol.step_params import StepParams
 from service.core.records.events import ArtefactRef, Record, ViewImported
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList, PhotographRole
+from service.core.records.optics import RecordedOptics
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 from service.steps.optics import departing_images, optics_departures
@@ -78,7 +77,7 @@ def _bring_in(context: StepContext, params: Params, listed: ImportList, view: Im
     """Store one photograph: first its files, then its rows and its event in one transaction."""
     photograph = _put(context, listed, view.photograph, _KINDS[params.photographs])
     refs = (photograph, *(_put(context, listed, raw, "raw") for raw in view.raws))
-    settings = stated_settings_agree(StatedSettings.model_validate(view.camera), context.protocol.camera)
+    settings = stated_settings_agree(view.optics, context.protocol.camera)
     rows = tuple(
         NewArtefact(
             ref=ref,
@@ -119,15 +118,7 @@ def _put(context: StepContext, listed: ImportList, file: ImportedFile, kind: str
     return ref
 
 
-class StatedSettings(BaseModel):
-    """The settings in a photograph's EXIF; 0 and None: not given."""
-
-    aperture_f: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-
-
-def stated_settings_agree(stated: StatedSettings, wanted: CameraSection | None) -> bool | None:
+def stated_settings_agree(stated: RecordedOptics, wanted: CameraSection | None) -> bool | None:
     """Return whether aperture, exposure time and ISO of a photograph are those of the protocol, as in a capture.
 
     The answer is None if the protocol sets none, or the file gives none of the three.

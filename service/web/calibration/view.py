@@ -12,8 +12,9 @@ from service.computations import calibrate
 from service.computations.calibrate.records import ArmAnswer, HandEye, Intrinsics, Residuals
 from service.computations.records import Camera
 from service.core.protocol.models import Step
-from service.core.recorded_devices import RecordedIdentity, RecordedOptics, recorded_optics, recorded_report
+from service.core.recorded_devices import RecordedIdentity, recorded_report
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
+from service.core.records.optics import RecordedOptics
 from service.core.run.state import StepState
 from service.followed_run import RunRecord
 from service.steps.kinds.calibration import Params
@@ -317,7 +318,7 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
         if isinstance(event.payload, DeviceOpened)
     }
     models = [identity.model for identity in known.values() if identity.kind == "camera"]
-    stated = RecordedOptics() if first is None else recorded_optics(first.camera)
+    stated = RecordedOptics() if first is None else first.optics
     robots = [(name, known.get(name, RecordedIdentity())) for name in calibration.robots]
     return Certificate(
         stated,

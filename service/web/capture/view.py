@@ -13,8 +13,8 @@ import numpy as np
 from service.computations import further_view, live_summary, live_view
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Protocol, Step
-from service.core.recorded_devices import RecordedOptics, recorded_optics
 from service.core.records.events import OperatorAction, ViewpointCaptured
+from service.core.records.optics import RecordedOptics
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
@@ -256,7 +256,7 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
     limit = ""
     if demanded is not None:
         limit = f"wanted {_settings(demanded.aperture_f, demanded.exposure_s, demanded.iso)}"
-    out.append(settings_verdict(recorded_optics(payload.camera), payload.verdicts.get("settings"), limit))
+    out.append(settings_verdict(payload.optics, payload.verdicts.get("settings"), limit))
     return out
 
 
@@ -382,11 +382,11 @@ def camera_images(
         verdicts: the verdicts on the first camera's image.
         others: valid captures of the step, whose images each camera's is compared with.
     """
-    size = recorded_optics(capture.payload.camera)
+    size = capture.payload.optics
     images = [CameraImage("", "on the arm", capture.sha256, size.width or 3, size.height or 2, verdicts)]
     beside = {name: [job.live for job in mine] for name, mine in _by_device(log, others).items()}
     for one in further_of(log, capture):
-        stated, device = recorded_optics(one.exposure.camera), one.exposure.device
+        stated, device = one.exposure.optics, one.exposure.device
         found = looked_at(one.live, beside.get(device, ()), _FEWEST_SPHERES)
         found.append(settings_verdict(stated, one.exposure.verdicts.get("settings")))
         place = _MOUNTED[one.exposure.mounted]
@@ -412,13 +412,13 @@ def sheet_image(log: RunRecord, capture: Capture, uses: Mapping[str, BoardUse], 
     if device:
         mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
         return None if mine is None else _of_further(capture, mine)
-    size = recorded_optics(capture.payload.camera)
+    size = capture.payload.optics
     word, tone, why = _word(capture, uses.get(capture.sha256))
     return SheetImage(capture, capture.sha256, size.width or 3, size.height or 2, word, tone, why)
 
 
 def _of_further(capture: Capture, mine: FurtherCapture) -> SheetImage:
-    size = recorded_optics(mine.exposure.camera)
+    size = mine.exposure.optics
     if capture.replaced is not None:
         word, tone, why = "Replaced", "quiet", capture.replaced.reason
     elif mine.exposure.verdicts.get("settings") is False:

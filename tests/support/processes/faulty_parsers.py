@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
-from bench.torture.fuzz.mutations import flip
-from bench.torture.fuzz.targets.target import Target
 from service.core.errors import DataError
+from tests.support.torture.fuzz.mutations import flip
+from tests.support.torture.fuzz.targets.target import Target
 
 _KEPT: list[bytes] = []
 

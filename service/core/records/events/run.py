@@ -8,6 +8,7 @@ from pydantic import Field
 
 from service.core.records.base import ArtefactRef, Record
 from service.core.records.entered import RunAbout
+from service.core.records.optics import RecordedOptics, recorded_optics
 
 
 class RunStarted(Record):
@@ -213,9 +214,14 @@ class RecordedView(Record):
     viewpoint: str  # name of the view, unique within its step
     station: str  # the robot's station; "" without one
     artefacts: tuple[ArtefactRef, ...]  # the photograph first
-    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    camera: dict[str, Any]  # as its driver or its file stated it; read by `optics`
     environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
     verdicts: dict[str, bool] = Field(default_factory=dict)  # still, settings, sharp …
+
+    @property
+    def optics(self) -> RecordedOptics:
+        """Return what the photograph states of its camera, lens and settings."""
+        return recorded_optics(self.camera)
 
 
 class FurtherExposure(Record):
@@ -225,10 +231,15 @@ class FurtherExposure(Record):
     mounted: Literal["fixed", "rigid"]  # in the room, or beside the first camera
     artefacts: tuple[ArtefactRef, ...]  # the photograph first
     calibration: ArtefactRef  # file with the intrinsics of this camera
-    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    camera: dict[str, Any]  # as its driver or its file stated it; read by `optics`
     trigger_monotonic_s: float
     arrival_monotonic_s: float
     verdicts: dict[str, bool] = Field(default_factory=dict[str, bool])  # settings; the view's own include them
+
+    @property
+    def optics(self) -> RecordedOptics:
+        """Return what the photograph states of its camera, lens and settings."""
+        return recorded_optics(self.camera)
 
 
 class ViewpointCaptured(RecordedView):

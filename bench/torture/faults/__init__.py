@@ -1,1 +1,0 @@
-"""The fault matrix, `make torture-faults`: every kind of message of every device, spoilt in every way."""

@@ -1,1 +1,0 @@
-"""How a case ended, whether that obeys the rules, and the table of all."""

@@ -1,1 +1,0 @@
-"""What is fuzzed: every parser of the project, by where its input comes from."""
