@@ -20,7 +20,7 @@ from simulators.canon_camera.formats import CODES, FORMATS, ImageFormat, of_numb
 from simulators.recordings import recorded_device
 from simulators.serve import SimulatorError
 
-MODEL, FIRMWARE, LENS, SERIAL = "Canon EOS R5", "3-1.8.2", "RF24-70mm F2.8 L IS USM", "042021006092"
+MODEL, FIRMWARE, LENS, SERIAL = "Canon EOS R5", "3-1.8.2", "RF24-70mm F2.8 L IS USM", "012025000017"
 _MAKER = "Canon"
 _FOLDER = Path(str(resources.files("simulators.canon_camera"))) / "recordings"
 _EVENTS = range(0xD001, 0xD200)  # codes of which a body tells in events

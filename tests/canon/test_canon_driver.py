@@ -34,7 +34,7 @@ def camera() -> Iterator[Camera]:
 
 def test_identity_and_report(camera: Camera) -> None:
     report = camera.report()
-    assert (report.identity.model, report.identity.serial) == ("Canon EOS R5", "42021006092")
+    assert (report.identity.model, report.identity.serial) == ("Canon EOS R5", "12025000017")
     assert report.details["profile"] == "canon_eos"
     assert report.battery_fraction == pytest.approx(1.0)
     assert report.free_bytes is not None
@@ -87,7 +87,7 @@ def test_files_are_those_on_the_card_and_advance(tmp_path: Path) -> None:
     assert [file.media_type for file in second.files] == ["image/jpeg", "image/x-canon-cr3"]
     assert [file.camera_name for file in third.files] == ["IMG_0003.CR3"]
     assert (first.exif.aperture_f, first.exif.exposure_s, first.exif.iso) == (22.0, pytest.approx(1 / 15), 100)
-    assert (first.lens, first.body_serial) == ("RF24-70mm F2.8 L IS USM", "042021006092")
+    assert (first.lens, first.body_serial) == ("RF24-70mm F2.8 L IS USM", "012025000017")
 
 
 @pytest.mark.slow

@@ -303,6 +303,9 @@ RUN_ELSEWHERE = {
         "tests/scanner/test_scan_ct_simulators.py::test_the_products_of_one_acquisition_are_delivered_together"
     ),
     "orthocapture simulate canon": "tests/canon/test_canon_driver.py::test_identity_and_report",
+    "orthocapture simulate canon --recorded eos-r5-1.2.0": (
+        "tests/canon/test_recorded_canons.py::test_a_recorded_body_is_driven_or_refused_in_words_that_help"
+    ),
     "orthocapture simulate camera --recorded ilce-7rm5-2.02": (
         "tests/camera/test_recorded_bodies.py::test_a_recorded_body_is_driven_or_refused_in_words_that_help"
     ),
