@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import get_args
 
-from pydantic import BaseModel
-
 from docs.generate.fields import docstring, field_table, record_sections, records_below
 from service.core.records.base import ArtefactRef
 from service.core.records.events import Event, Payload
@@ -33,8 +31,8 @@ def events_text() -> str:
         "",
     ]
     lines += ["`payload` is one of the following; its `kind` says which.", ""]
-    payloads: list[type[BaseModel]] = list(get_args(get_args(Payload)[0]))
-    below: dict[str, type[BaseModel]] = {ArtefactRef.__name__: ArtefactRef}
+    payloads: list[type[Any]] = list(get_args(get_args(Payload)[0]))
+    below: dict[str, type[Any]] = {ArtefactRef.__name__: ArtefactRef}
     for payload in payloads:
         kind = payload.model_fields["kind"].default
         lines += [f"## {kind}", "", docstring(payload), "", *field_table(payload, without=("kind",)), ""]

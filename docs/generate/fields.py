@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import inspect
 import io
 import re
@@ -10,7 +11,7 @@ import textwrap
 import tokenize
 from collections.abc import Iterator, Mapping
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -31,12 +32,12 @@ _ATTRIBUTES = re.compile(r"\n\nAttributes:\n")
 _HEAD = ("| key | type | default | unit | meaning |", "|---|---|---|---|---|")
 
 
-def field_table(model: type[BaseModel], *, without: tuple[str, ...] = ()) -> list[str]:
+def field_table(model: type[Any], *, without: tuple[str, ...] = ()) -> list[str]:
     """Lines of a Markdown table; `without` names fields that are left out."""
     comments = field_comments(model)
     rows = [
         f"| `{name}` | {_type_of(field)} | {_default(field)} | {_unit(name, field)} | {comments.get(name, '')} |"
-        for name, field in model.model_fields.items()
+        for name, field in _fields_of(model).items()
         if name not in without
     ]
     return [*_HEAD, *rows] if rows else ["No keys."]
@@ -47,7 +48,7 @@ def docstring(model: Any) -> str:
     return _ATTRIBUTES.split(inspect.cleandoc(model.__doc__))[0] if model.__doc__ else ""
 
 
-def record_sections(below: Mapping[str, type[BaseModel]], level: str = "###") -> list[str]:
+def record_sections(below: Mapping[str, type[Any]], level: str = "###") -> list[str]:
     """Lines with a heading, the docstring and the table of each record that `records_below` found."""
     lines: list[str] = []
     for name, model in below.items():
@@ -62,11 +63,11 @@ def unit_of(name: str) -> str:
 
 
 def records_below(
-    model: type[BaseModel], seen: dict[str, type[BaseModel]] | None = None, *, without: tuple[str, ...] = ()
-) -> dict[str, type[BaseModel]]:
+    model: type[Any], seen: dict[str, type[Any]] | None = None, *, without: tuple[str, ...] = ()
+) -> dict[str, type[Any]]:
     """The records that its fields are made of, at any depth, by name, in the order of the fields."""
     found = {} if seen is None else seen
-    for field in (field for name, field in model.model_fields.items() if name not in without):
+    for field in (field for name, field in _fields_of(model).items() if name not in without):
         for inner in _records_in(field.annotation):
             if inner.__name__ not in found:
                 found[inner.__name__] = inner
@@ -74,21 +75,38 @@ def records_below(
     return found
 
 
-def field_comments(model: type[BaseModel]) -> dict[str, str]:
+def field_comments(model: type[Any]) -> dict[str, str]:
     """Return what the code says of each field: among the docstring's attributes, or beside or right above it."""
     out: dict[str, str] = {}
     for base in reversed(model.__mro__):
-        if issubclass(base, BaseModel) and base is not BaseModel:
+        if _is_record(base) and base is not BaseModel:
             out |= _attributes_of(base)
             out |= _comments_in(textwrap.dedent(inspect.getsource(base)))
-    for name, field in model.model_fields.items():
+    for name, field in _fields_of(model).items():
         if field.description:
             out[name] = field.description
     said = {name: re.sub(r"\bNone: ", "without it: ", text) for name, text in out.items()}
     return {name: text.replace("|", "\\|") for name, text in said.items()}
 
 
-def _attributes_of(model: type[BaseModel]) -> dict[str, str]:
+def _is_record(annotation: Any) -> bool:
+    """Whether a type is a record whose fields are listed: a model or a dataclass."""
+    return isinstance(annotation, type) and (issubclass(annotation, BaseModel) or dataclasses.is_dataclass(annotation))
+
+
+def _fields_of(model: type[Any]) -> dict[str, FieldInfo]:
+    if issubclass(model, BaseModel):
+        return model.model_fields
+    types = get_type_hints(model, include_extras=True)
+    return {
+        field.name: FieldInfo.from_annotation(types[field.name])
+        if field.default is dataclasses.MISSING
+        else FieldInfo.from_annotated_attribute(types[field.name], field.default)
+        for field in dataclasses.fields(model)
+    }
+
+
+def _attributes_of(model: type[Any]) -> dict[str, str]:
     _, *attributes = _ATTRIBUTES.split(inspect.cleandoc(model.__doc__ or ""))
     lines = re.split(r"\n(?! {5})", "".join(attributes))  # what is indented further goes on with the line before
     pairs = (line.strip().partition(": ") for line in lines)
@@ -118,8 +136,8 @@ def _comments_in(source: str) -> dict[str, str]:
     return out
 
 
-def _records_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _records_in(annotation: Any) -> Iterator[type[Any]]:
+    if _is_record(annotation):
         yield annotation
     for inner in get_args(annotation):
         yield from _records_in(inner)
@@ -144,7 +162,7 @@ def _words(annotation: Any, metadata: tuple[Any, ...] = ()) -> str:
         said = _many(inner, bounds)
     elif origin is not None and issubclass(origin, Mapping):
         said = f"mapping of {_words(inner[0])} to {_words(inner[1])}"
-    elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    elif _is_record(annotation):
         said = f"[{annotation.__name__}](#{annotation.__name__.lower()})"
     else:
         said = f"{_PLAIN.get(annotation, getattr(annotation, '__name__', str(annotation)))}{bounds}"
