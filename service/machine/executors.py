@@ -11,10 +11,13 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 from service.logs.terminal import show_own_words_only
 from service.machine.resources import processor_model
+
+if TYPE_CHECKING:
+    from service.machine.schedulers import Scheduler
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -100,6 +103,22 @@ def computing_on(executors: Executors) -> Generator[None]:
         yield
     finally:
         _chosen.reset(before)
+
+
+@contextmanager
+def computing_at(scheduler: Scheduler | None) -> Generator[None]:
+    """Choose the executors of a scheduler's cluster for the maps of this block; None: the local ones."""
+    if scheduler is None:
+        yield
+        return
+    from service.machine.schedulers import RemoteExecutors  # noqa: PLC0415 - few programs have a cluster
+
+    executors = RemoteExecutors(scheduler)
+    try:
+        with computing_on(executors):
+            yield
+    finally:
+        executors.close()
 
 
 @contextmanager
