@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import Any, get_args
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
 from service.core.records.base import ArtefactRef

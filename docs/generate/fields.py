@@ -91,7 +91,8 @@ def field_comments(model: type[Any]) -> dict[str, str]:
 
 def _is_record(annotation: Any) -> bool:
     """Whether a type is a record whose fields are listed: a model or a dataclass."""
-    return isinstance(annotation, type) and (issubclass(annotation, BaseModel) or dataclasses.is_dataclass(annotation))
+    is_class = isinstance(annotation, type)
+    return is_class and (issubclass(annotation, BaseModel) or dataclasses.is_dataclass(annotation))
 
 
 def _fields_of(model: type[Any]) -> dict[str, FieldInfo]:

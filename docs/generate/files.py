@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import entry_points
+from typing import Any
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
 from drivers.plugin import DriverSpec

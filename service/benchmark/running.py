@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shlex
 import shutil
 import subprocess
@@ -29,6 +28,7 @@ from service.core.units import gigabytes, megabytes
 from service.dataset.exported import scaled_data_set
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.records import DataSet
+from service.machine.resources import processor_model
 from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
 
@@ -87,11 +87,8 @@ def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
 
 def this_machine() -> Machine:
     """Return the machine that this program runs on."""
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return Machine(
-        processor=models[0] if models else platform.processor() or platform.machine(),
+        processor=processor_model(),
         cores=os.cpu_count() or 1,
         memory_gb=round(gigabytes(psutil.virtual_memory().total), 1),
         gpu=_gpu(),

@@ -25,6 +25,15 @@ from service.cli.common import (
     write_whole,
 )
 from service.cli.exit_status import ExitStatus
+from service.cli.scheduler import (
+    PATIENCE_S,
+    SchedulerCaOption,
+    SchedulerCertOption,
+    SchedulerKeyOption,
+    SchedulerOption,
+    SchedulerPatienceOption,
+    reached_scheduler,
+)
 from service.cli.spheres import SeedsOption, spheres_of
 from service.computations.detect_spheres import DetectorName
 from service.computations.detect_spheres.compute import detector_of, search_outlines
@@ -46,6 +55,7 @@ from service.core.geometry import Array
 from service.core.protocol.models import Gate
 from service.core.records.events import GateVerdict
 from service.core.units import metres, mm
+from service.machine.executors import computing_at
 
 _MOST_MM = 0.35  # the paper's mean radial error
 _MOST_WORST_MM = 0.5  # radial error of one control sphere
@@ -114,6 +124,11 @@ def register_command(
             help="For --detector grounded and vote: folder with grounding-dino/ and sam2/, the networks' weights.",
         ),
     ] = None,
+    scheduler: SchedulerOption = "",
+    scheduler_ca: SchedulerCaOption = None,
+    scheduler_cert: SchedulerCertOption = None,
+    scheduler_key: SchedulerKeyOption = None,
+    scheduler_patience: SchedulerPatienceOption = PATIENCE_S,
     strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -138,7 +153,10 @@ def register_command(
         processes = min(len(files), workers or os.cpu_count() or 1)
         posed = PosedImages(T_world_camera, model, metric=not estimate_scale, names=names)
         scanned = ScanSpheres(registration_m, radius_m, control_m=control_m)
-        with progress_bar(quiet=json) as progress:
+        cluster = reached_scheduler(
+            scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
+        )
+        with progress_bar(quiet=json) as progress, computing_at(cluster):
             # Control spheres take no part in choosing outlines: they are searched for once the poses are known.
             located = search_outlines(
                 files,

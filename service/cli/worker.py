@@ -17,6 +17,15 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.cli.scheduler import (
+    PATIENCE_S,
+    SchedulerCaOption,
+    SchedulerCertOption,
+    SchedulerKeyOption,
+    SchedulerOption,
+    SchedulerPatienceOption,
+    reached_scheduler,
+)
 from service.core.text.words import counted
 from service.logs.file_log import file_log
 from service.store.access import kept_to
@@ -29,6 +38,11 @@ def worker_command(
     jobs: Annotated[
         int, typer.Option("--jobs", min=0, help="Number of jobs to compute at once; 0: one per core.")
     ] = 0,
+    scheduler: SchedulerOption = "",
+    scheduler_ca: SchedulerCaOption = None,
+    scheduler_cert: SchedulerCertOption = None,
+    scheduler_key: SchedulerKeyOption = None,
+    scheduler_patience: SchedulerPatienceOption = PATIENCE_S,
     parent: Annotated[
         int, typer.Option("--parent", hidden=True, help="End when this process is not the parent.")
     ] = 0,
@@ -43,12 +57,16 @@ def worker_command(
 
     signal.signal(signal.SIGTERM, on_terminate)
     with reporting_errors(json), kept_to(data), file_log(data, "worker"), progress_bar(quiet=json) as progress:
+        cluster = reached_scheduler(
+            scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
+        )
         done = work_side_by_side(
             data,
             at_once=jobs or os.cpu_count() or 1,
             until_idle=until_idle,
             stop=lambda: stopped or (parent != 0 and os.getppid() != parent),
             progress=progress,
+            scheduler=cluster,
         )
         if json:
             print_json({"jobs": done})

@@ -20,7 +20,7 @@ from service.compute.images.photographs import read_image
 from service.compute.pixels.resample import resample
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.machine.processes import mapping
+from service.machine.executors import mapping
 from service.machine.resources import IMAGE_MB, processes_for
 
 _A = TypeVar("_A", bound=ImagesCamera)

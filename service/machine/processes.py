@@ -1,4 +1,4 @@
-"""Work in child processes: a map over several, and a call with limits that damaged input cannot pass."""
+"""A call in a child process, with limits that damaged input cannot pass."""
 
 from __future__ import annotations
 
@@ -6,55 +6,18 @@ import importlib
 import multiprocessing
 import resource
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from math import ceil
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import psutil
 
 from service.logs.terminal import show_own_words_only
 
-_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-
-
-class MapFunction(Protocol):
-    """`map`, in this process or over several."""
-
-    def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
-        """Return the results of `work` on the items, in their order."""
-        ...
-
-
-@contextmanager
-def mapping(workers: int, items: int) -> Generator[MapFunction]:
-    """Provide a map over at most so many processes, with a thread of OpenCV each; the plain one for one worker."""
-    if workers <= 1 or items <= 1:
-        yield map
-        return
-    # Forking a process with threads may deadlock.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, items), mp_context=context, initializer=_one_thread) as pool:
-        yield pool.map
-
-
-def report_each(
-    results: Iterable[_Result], total: int, progress: Callable[[int, int], None] | None
-) -> Iterator[_Result]:
-    """Yield the results, and report after each how many of all there are; `progress` None reports nothing."""
-    for done, result in enumerate(results, 1):
-        yield result
-        if progress is not None:
-            progress(done, total)
-
-
-def _one_thread() -> None:
-    show_own_words_only()
-    importlib.import_module("cv2").setNumThreads(1)
 
 
 @dataclass(frozen=True, slots=True)

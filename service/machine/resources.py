@@ -5,9 +5,11 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+import platform
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import cast
 
@@ -48,6 +50,15 @@ def processes_for(items: int, each_mb: float, memory: MachineMemory | None = Non
     """Return the number of processes that share this work: one a core, as long as they fit into half the memory."""
     fit = int(0.5 * (memory or machine_memory()).total_mb / each_mb)
     return max(1, min(items, os.cpu_count() or 1, fit))
+
+
+@cache
+def processor_model() -> str:
+    """Return the model of this machine's processor, as the system names it."""
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
 
 
 def _groups(root: Path) -> Iterator[tuple[int, int]]:

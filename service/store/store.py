@@ -13,7 +13,7 @@ from typing import Any, Self
 from sqlalchemy import Connection, bindparam, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.core.records.events import ArtefactRef, ComputedOn, Event, JobFinished, Payload, RunStarted, SiteOpened
 from service.core.run.state import Lane
 from service.core.shown_text import storable
 from service.store import jobs as queue
@@ -387,6 +387,7 @@ class Store:
         result: Mapping[str, Any] | None = None,
         artefacts: Sequence[NewArtefact] = (),
         late_s: float | None = None,
+        computed_on: ComputedOn | None = None,
         follow: tuple[int, Callable[[Sequence[Event]], Sequence[NewJob]]] | None = None,
     ) -> Event:
         """Append JobFinished with its artefacts and close the job. Raises LeaseLostError.
@@ -398,6 +399,7 @@ class Store:
             result: the answer as plain data.
             artefacts: the answer's files.
             late_s: seconds from when the specimen was freed to this answer; None if it is in time.
+            computed_on: the processors that computed it; None if they are not known.
             follow: a sequence number and a function that gets all events after it and returns the jobs that follow;
                 they are enqueued in the same transaction, so that a crash cannot lose them.
         """
@@ -412,6 +414,7 @@ class Store:
             result=dict(result or {}),
             duration_s=duration_s,
             late_s=late_s,
+            computed_on=computed_on,
         )
         with self._database.writing() as connection:
             event = queue.finish(connection, self._clock, job, payload)

@@ -11,7 +11,7 @@ from service.computations.job import JobAnswer
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.gates.release import late_s
 from service.core.jobs import jobs_of, references_in, resolve
-from service.core.records.events import Event
+from service.core.records.events import ComputedOn, Event
 from service.core.run.fold import advance
 from service.followed_run import RunFollower
 from service.run_record import recorded_protocol, recorded_root
@@ -45,7 +45,7 @@ class FollowedRuns:
             )
         return resolve(job.arguments, jobs_of(log.refresh()))
 
-    def finish(self, job: Job, answer: JobAnswer, duration_s: float) -> None:
+    def finish(self, job: Job, answer: JobAnswer, duration_s: float, computed_on: ComputedOn) -> None:
         """Record an answer and, in one transaction, enqueue the jobs that it makes possible. Raises LeaseLostError.
 
         If the run has ended, the answer is signed at once, because no runner will do it.
@@ -64,6 +64,7 @@ class FollowedRuns:
             result=answer.result,
             artefacts=[NewArtefact(r, "worker", job.step, job.attempt) for r in answer.artefacts],
             late_s=late,
+            computed_on=computed_on,
             follow=follow,
         )
         self.seal(job.run_id)

@@ -8,7 +8,7 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,8 +21,11 @@ from service.computations.kind import Demand
 from service.computations.memory_grants import MemoryGrants
 from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
+from service.core.records.events import ClusterHost, ComputedOn
 from service.core.run.state import Lane
 from service.logs.file_log import at
+from service.machine.executors import Place, noting_places
+from service.machine.resources import processor_model
 from service.store.records import Job, LeaseLostError
 from service.store.store import Store
 
@@ -120,7 +123,7 @@ def _do(
             yield
 
     progress(term(job.kind), 0, 0)
-    with attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
+    with noting_places() as places, attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
         arguments = following.resolved(job)
         answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress, begin))
     if attempt.over:
@@ -130,9 +133,15 @@ def _do(
             store.fail_job(job, attempt.error, retry=_worth_another_try(attempt.error))
             following.seal(job.run_id)
             return
-        following.finish(job, answer, store.clock.monotonic_s() - started_s)
+        following.finish(job, answer, store.clock.monotonic_s() - started_s, _computed_on(places))
     except LeaseLostError:
         _log.warning("job %s was taken over by another worker; its result stands", job.job_id)
+
+
+def _computed_on(places: Mapping[Place, int]) -> ComputedOn:
+    """Return the record of the processors: this machine's, and those of the cluster's tasks."""
+    hosts = (ClusterHost(host=at.host, processor=at.processor, tasks=count) for at, count in sorted(places.items()))
+    return ComputedOn(processor=processor_model(), cluster=tuple(hosts))
 
 
 def _worth_another_try(error: Exception) -> bool:

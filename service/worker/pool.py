@@ -20,14 +20,19 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from service.core.run.state import Lane
 from service.logs.file_log import file_log
 from service.logs.terminal import show_own_words_only
+from service.machine.executors import computing_at
 from service.machine.resources import compute_in_background, keep_freed_memory
 from service.monitor.snapshot import SignOfLife
 from service.store.store import Store
 from service.worker.loop import work
+
+if TYPE_CHECKING:
+    from service.machine.schedulers import Scheduler
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.2
@@ -51,8 +56,9 @@ class _Child:
 class Pool:
     """The children of one worker, as a context manager: at its end they are stopped and their jobs queued again."""
 
-    def __init__(self, store: Store, data: Path, at_once: int) -> None:
+    def __init__(self, store: Store, data: Path, at_once: int, scheduler: Scheduler | None = None) -> None:
         self.done = 0
+        self._scheduler = scheduler
         self._store, self._data = store, data
         self._scratch = tempfile.TemporaryDirectory(prefix="orthocapture-worker-", ignore_cleanup_errors=True)
         self._context = multiprocessing.get_context("spawn")
@@ -114,7 +120,7 @@ class Pool:
     def _start(self, lane: Lane) -> _Child:
         ours, theirs = self._context.Pipe(duplex=False)
         scratch = Path(tempfile.mkdtemp(dir=self._scratch.name))
-        arguments = (self._data, lane, scratch, theirs, os.getpid())
+        arguments = (self._data, lane, scratch, theirs, os.getpid(), self._scheduler)
         process = self._context.Process(target=_serve, args=arguments, name=f"orthocapture-{lane}")
         process.start()
         theirs.close()
@@ -136,7 +142,13 @@ def _kill(group: int) -> None:
 
 
 def work_side_by_side(
-    data: Path, *, at_once: int, until_idle: bool, stop: Callable[[], bool], progress: Progress
+    data: Path,
+    *,
+    at_once: int,
+    until_idle: bool,
+    stop: Callable[[], bool],
+    progress: Progress,
+    scheduler: Scheduler | None = None,
 ) -> int:
     """Compute the jobs of a data folder in parallel until `stop()`.
 
@@ -146,6 +158,7 @@ def work_side_by_side(
         until_idle: true to end when no job is open.
         stop: called several times a second.
         progress: called with what a job does, how much is done, and the total.
+        scheduler: that of the cluster which computes what is parallel inside a job; None: this machine does.
 
     Returns:
         the number of jobs computed.
@@ -153,7 +166,7 @@ def work_side_by_side(
     with Store.open(data) as store:
         if until_idle and not store.open_jobs():
             return 0
-        with Pool(store, data, at_once) as pool, contextlib.closing(SignOfLife(data, store.clock)) as sign:
+        with Pool(store, data, at_once, scheduler) as pool, contextlib.closing(SignOfLife(data, store.clock)) as sign:
             while not stop():
                 pool.tend(progress)
                 sign.give(pool.done)
@@ -167,7 +180,7 @@ def work_side_by_side(
 # --- in a child ---------------------------------------------------------------------------------------------------
 
 
-def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int) -> None:
+def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int, scheduler: Scheduler | None) -> None:
     """Run a child: its entry point."""
     show_own_words_only()
     os.setsid()  # Ctrl-C must reach only the worker, which ends its children and their processes
@@ -185,7 +198,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
         tell("", -1, -1)
         _kill(os.getpid())  # no thread can stop a computation in another one; the worker starts a new child
 
-    with file_log(data, "worker"), Store.open(data) as store:
+    with file_log(data, "worker"), Store.open(data) as store, computing_at(scheduler):
         work(
             store,
             until_idle=False,

@@ -100,6 +100,9 @@ RUN_HERE: dict[str, Check] = {
 }
 # Commands that take minutes, a whole rig or a network, with the test of what they run, at a smaller size if need be.
 RUN_ELSEWHERE = {
+    "orthocapture worker --data runs --scheduler tcp://head:8786": (
+        "tests/cluster/test_cluster.py::test_a_worker_of_a_cluster_records_the_processors_that_computed_an_answer"
+    ),
     "orthocapture compare RUN OTHER --data runs": (
         "tests/audit/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
     ),

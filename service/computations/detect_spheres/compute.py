@@ -31,6 +31,7 @@ from service.compute.markers.records import DetectionOptions, SphereOutline, out
 from service.compute.markers.refine import remeasure_file
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
+from service.machine.executors import IN_THIS_PROCESS
 from service.machine.resources import IMAGE_MB, processes_for
 
 
@@ -177,7 +178,7 @@ def search_outlines(
     """
     if detect is not None or posed is None:
         # One process has the networks, which use all cores by themselves.
-        at_once = 1 if isinstance(detect, GroundedDetector) else workers
+        at_once = IN_THIS_PROCESS if isinstance(detect, GroundedDetector) else workers
         return searched_whole(detect_all(files, camera, options, at_once, progress, detect=detect))
     return locate_outlines(files, posed, spheres, scenes=scenes, options=options, workers=workers, progress=progress)
 

@@ -19,7 +19,7 @@ from service.compute.images.photographs import read_grey
 from service.compute.intrinsics.adjustment import fit_pose, pose_matrix, start_pose
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse
-from service.machine.processes import mapping, report_each
+from service.machine.executors import IN_THIS_PROCESS, mapping, report_each
 
 _MANY_FILES = 24
 _MANY_BYTES = 30e6
@@ -73,7 +73,7 @@ def find_boards(
     if board.pattern == "charuco":
         board.charuco()
     work = partial(_find, board=board)
-    with mapping(workers if _worth_processes(files) else 1, len(files)) as map_over:
+    with mapping(workers if _worth_processes(files) else IN_THIS_PROCESS, len(files)) as map_over:
         return tuple(report_each(map_over(work, files), len(files), progress))
 
 

@@ -36,7 +36,7 @@ from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
-from service.machine.processes import MapFunction, mapping, report_each
+from service.machine.executors import MapFunction, mapping, report_each
 
 _MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
 

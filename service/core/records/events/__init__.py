@@ -20,7 +20,9 @@ from service.core.records.events.operator import (
 )
 from service.core.records.events.run import (
     CaptureAsked,
+    ClusterHost,
     ComputedBy,
+    ComputedOn,
     DeviceOpened,
     DeviceTrouble,
     FilesKept,
@@ -74,7 +76,9 @@ __all__ = [
     "ActionRefused",
     "ArtefactRef",
     "CaptureAsked",
+    "ClusterHost",
     "ComputedBy",
+    "ComputedOn",
     "ControlTaken",
     "DataRestored",
     "DeviceOpened",

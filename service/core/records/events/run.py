@@ -317,6 +317,21 @@ class JobEnqueued(Record):
     version: int = 1  # of the computation (JobKind.version): 1 copies earlier results, later ones refer to them
 
 
+class ClusterHost(Record):
+    """A machine of a cluster that computed parts of a job."""
+
+    host: str
+    processor: str  # model, as its system names it
+    tasks: int
+
+
+class ComputedOn(Record):
+    """The processors that computed an answer: another model may give other last bits."""
+
+    processor: str  # model of the worker's machine, as its system names it
+    cluster: tuple[ClusterHost, ...] = ()  # () if the worker's machine computed everything
+
+
 class JobFinished(Record):
     """The worker's result."""
 
@@ -331,6 +346,7 @@ class JobFinished(Record):
     result: dict[str, Any] = Field(default_factory=dict)
     duration_s: float
     late_s: float | None = None  # after the specimen was freed, or the run's end; None: in time
+    computed_on: ComputedOn | None = None  # None in records of earlier versions
 
 
 class JobFailed(Record):

@@ -1,0 +1,173 @@
+"""The one seam of what is parallel inside a job: a map over an executor, of local processes or of what was chosen."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import socket
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
+
+from service.logs.terminal import show_own_words_only
+from service.machine.resources import processor_model
+
+if TYPE_CHECKING:
+    from service.machine.schedulers import Scheduler
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+_P = ParamSpec("_P")
+
+IN_THIS_PROCESS = 0  # a number of processes: the work is not worth others, whichever executor was chosen
+
+
+class MapFunction(Protocol):
+    """`map`, in this process or over several."""
+
+    def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
+        """Return the results of `work` on the items, in their order."""
+        ...
+
+
+class Executors(Protocol):
+    """Opens the executors that compute what is parallel inside a job."""
+
+    def open(self, processes: int, items: int) -> AbstractContextManager[Executor]:
+        """Open an executor for some work.
+
+        Args:
+            processes: the number of processes that this machine can give; IN_THIS_PROCESS: none besides this one.
+            items: the number of items, which compute independently.
+        """
+        ...
+
+
+class InThisProcess(Executor):
+    """Computes each call in this process: a map when its next result is asked for, a submitted call at once."""
+
+    def submit(self, fn: Callable[_P, _Result], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_Result]:
+        """Call the function and return its result or exception as a future."""
+        future: Future[_Result] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # noqa: BLE001 - a future holds whatever its call raises
+            future.set_exception(error)
+        return future
+
+    def map(
+        self,
+        fn: Callable[..., _Result],
+        *iterables: Iterable[Any],
+        timeout: float | None = None,
+        chunksize: int = 1,
+    ) -> Iterator[_Result]:
+        """Return the results in order; nothing is computed ahead. `timeout` and `chunksize` have no effect."""
+        return map(fn, *iterables)
+
+
+class LocalProcesses:
+    """Opens pools of processes on this machine, with a thread of OpenCV each; this process alone for one."""
+
+    def open(self, processes: int, items: int) -> AbstractContextManager[Executor]:
+        """Open a pool of at most so many processes."""
+        if processes <= 1 or items <= 1:
+            return nullcontext(InThisProcess())
+        return local_pool(min(processes, items))
+
+
+def local_pool(processes: int) -> ProcessPoolExecutor:
+    """Return a pool of processes on this machine, with a thread of OpenCV each."""
+    # Forking a process with threads may deadlock.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(processes, mp_context=context, initializer=_one_thread)
+
+
+def _one_thread() -> None:
+    show_own_words_only()
+    importlib.import_module("cv2").setNumThreads(1)
+
+
+_chosen: ContextVar[Executors] = ContextVar("_chosen", default=LocalProcesses())  # noqa: B039 - it has no state
+
+
+@contextmanager
+def computing_on(executors: Executors) -> Generator[None]:
+    """Choose the executors of every map that this block opens; without one, these are local processes."""
+    before = _chosen.set(executors)
+    try:
+        yield
+    finally:
+        _chosen.reset(before)
+
+
+@contextmanager
+def computing_at(scheduler: Scheduler | None) -> Generator[None]:
+    """Choose the executors of a scheduler's cluster for the maps of this block; None: the local ones."""
+    if scheduler is None:
+        yield
+        return
+    from service.machine.schedulers import RemoteExecutors  # noqa: PLC0415 - few programs have a cluster
+
+    executors = RemoteExecutors(scheduler)
+    try:
+        with computing_on(executors):
+            yield
+    finally:
+        executors.close()
+
+
+@contextmanager
+def mapping(processes: int, items: int) -> Generator[MapFunction]:
+    """Provide a map over the chosen executor: that of local processes has at most so many, none for one.
+
+    The functions and items of a map hold paths and small parameters, no large arrays: they travel to other machines.
+    """
+    with _chosen.get().open(processes, items) as executor:
+        yield executor.map
+
+
+def report_each(
+    results: Iterable[_Result], total: int, progress: Callable[[int, int], None] | None
+) -> Iterator[_Result]:
+    """Yield the results, and report after each how many of all there are; `progress` None reports nothing."""
+    for done, result in enumerate(results, 1):
+        yield result
+        if progress is not None:
+            progress(done, total)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Place:
+    """The host on which a task was computed, and the model of its processor: equal bits need equal models."""
+
+    host: str
+    processor: str
+
+
+def this_place() -> Place:
+    """Return the place of this process."""
+    return Place(socket.gethostname(), processor_model())
+
+
+_noted: ContextVar[Counter[Place] | None] = ContextVar("_noted", default=None)
+
+
+@contextmanager
+def noting_places() -> Generator[Counter[Place]]:
+    """Provide a count of the tasks that other machines compute for the maps of this block; empty if none does."""
+    places: Counter[Place] = Counter()
+    before = _noted.set(places)
+    try:
+        yield places
+    finally:
+        _noted.reset(before)
+
+
+def noted_places() -> Counter[Place]:
+    """Return the count of the block around; one that nobody reads if there is none."""
+    return noted if (noted := _noted.get()) is not None else Counter()

@@ -1,0 +1,78 @@
+"""A Dask cluster for tests: a scheduler and workers, each a process of its own on a free port."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+
+from tests.support.processes.waiting import until
+from tests.support.rig.rig import REPOSITORY
+
+_SCHEDULER, _WORKER = "distributed.cli.dask_scheduler", "distributed.cli.dask_worker"
+
+
+@dataclass
+class Cluster:
+    """The processes of a cluster and the address of its scheduler."""
+
+    address: str
+    folder: Path
+    options: Sequence[str]
+    scheduler: subprocess.Popen[bytes]
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list[subprocess.Popen[bytes]])
+
+    def add_worker(self, environment: Mapping[str, str] | None = None, *options: str) -> subprocess.Popen[bytes]:
+        """Start a worker with one thread, which computes one task at a time."""
+        name = f"worker{len(self.workers)}"
+        one = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder))
+        log = self.folder / f"{name}.log"
+        worker = _start([_WORKER, self.address, *one, *self.options, *options], log, environment or {})
+        self.workers.append(worker)
+        return worker
+
+
+@contextmanager
+def dask_cluster(
+    folder: Path, *, workers: int = 2, options: Sequence[str] = (), scheme: str = "tcp"
+) -> Generator[Cluster]:
+    """Start a scheduler and workers; end them after the block. `options` are given to each, such as files for tls."""
+    where = folder / "scheduler.json"
+    ports = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(where))
+    security = ("--protocol", scheme, *options)
+    scheduler = _start([_SCHEDULER, *ports, *security], folder / "scheduler.log", {})
+    cluster = Cluster("", folder, security, scheduler)
+    try:
+        until(where.is_file, lambda: (folder / "scheduler.log").read_text(encoding="utf-8"))
+        cluster.address = json.loads(where.read_text(encoding="utf-8"))["address"]
+        for _ in range(workers):
+            cluster.add_worker()
+        yield cluster
+    finally:
+        for process in [scheduler, *cluster.workers]:
+            end_tree(process)
+
+
+def end_tree(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and those that it started."""
+    if process.poll() is None:
+        for child in psutil.Process(process.pid).children(recursive=True):
+            child.kill()
+        process.kill()
+    process.wait()
+
+
+def _start(options: Sequence[str], log: Path, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+    own = {**os.environ, "PYTHONPATH": str(REPOSITORY), **environment}
+    with log.open("wb") as output:
+        return subprocess.Popen(
+            [sys.executable, "-m", *options], cwd=log.parent, env=own,
+            stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+        )  # fmt: skip
