@@ -40,7 +40,7 @@ def _data_folder(named: Path | None) -> Path | None:
     if named is None:
         return None
     folder = data_folder(named)
-    if folder.is_file():
+    if os.path.isfile(folder):
         raise typer.BadParameter(f"{named} is a file: name the data folder, or its site.yaml")
     return folder
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 SITE_FILE = "site.yaml"
@@ -9,4 +10,4 @@ SITE_FILE = "site.yaml"
 
 def data_folder(named: Path) -> Path:
     """Return the data folder that `--data` names: a folder, or the folder of a site.yaml."""
-    return named.parent if named.name == SITE_FILE and not named.is_dir() else named
+    return named.parent if named.name == SITE_FILE and not os.path.isdir(named) else named

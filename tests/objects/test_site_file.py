@@ -37,7 +37,7 @@ def test_a_short_file_has_usual_values(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "named"),
     [
         ("object_store: [", "not YAML"),
         ("objects: {}", "objects"),
@@ -50,8 +50,8 @@ def test_a_short_file_has_usual_values(tmp_path: Path) -> None:
         ("x" * 20_000, "too long"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, words: str) -> None:
-    assert words in refused(tmp_path, text)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
+    assert named in refused(tmp_path, text)
 
 
 def test_keys_that_others_may_read_and_keys_that_are_missing_are_refused(
@@ -62,14 +62,14 @@ def test_keys_that_others_may_read_and_keys_that_are_missing_are_refused(
     assert site is not None
     assert site.object_store is not None
     keys = tmp_path / "keys.yaml"
-    for text, mode, words in (
+    for text, mode, named in (
         ("access_key_id: a\nsecret_access_key: s", 0o640, "others than its owner"),
         ("access_key_id: a", 0o600, "incomplete"),
         ("{secret_access_key: hidden", 0o600, "not YAML"),
     ):
         keys.write_text(text)
         keys.chmod(mode)
-        with pytest.raises(ConfigurationError, match=words) as error:
+        with pytest.raises(ConfigurationError, match=named) as error:
             open_objects(tmp_path, site.object_store)
         assert "hidden" not in str(error.value)
     keys.write_text("access_key_id: a\nsecret_access_key: s")

@@ -20,7 +20,7 @@ class ObjectStoreAwayError(ObjectStoreError):
 
 @dataclass(frozen=True, slots=True)
 class StoredObject:
-    """What an object store states about one object.
+    """The statement of an object store about one object.
 
     Attributes:
         size_bytes: its size.

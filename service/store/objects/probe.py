@@ -35,7 +35,7 @@ def probe(objects: S3Objects, clock: Clock, *, lock_days: int | None = None) -> 
     content = f"canary of orthocapture {secrets.token_hex(16)}".encode()
     sha256 = hashlib.sha256(content).hexdigest()
     tried: list[tuple[str, Callable[[], None]]] = [
-        ("a new object is stored", lambda: _put(objects, sha256, content)),
+        ("a new object is stored", lambda: _store_canary(objects, sha256, content)),
         ("a second put of other bytes loses", lambda: _put_again(objects, sha256)),
         ("bytes that do not have the stated SHA-256 are refused", lambda: _put_wrong(objects)),
         ("what is fetched is what was put", lambda: _fetch(objects, sha256)),
@@ -59,7 +59,7 @@ def probe(objects: S3Objects, clock: Clock, *, lock_days: int | None = None) -> 
     return results
 
 
-def _put(objects: S3Objects, sha256: str, content: bytes) -> None:
+def _store_canary(objects: S3Objects, sha256: str, content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "canary")
         path.write_bytes(content)

@@ -42,7 +42,7 @@ def require_obstore() -> None:
         raise ConfigurationError(
             "site.yaml names an object store, and the package obstore is not installed",
             where="object_store",
-            remedy="Install it with `pip install 'orthocapture[site]'`",
+            remedy='Install it with `pip install "orthocapture[site]"`',
         )
 
 
@@ -92,15 +92,15 @@ class S3Objects:
             with path.open("rb") as file:
                 size = file.seek(0, 2)
                 if size == 0:
-                    return self._put(sha256, path, b"")
+                    return self._send(sha256, path, b"")
                 with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                    return self._put(sha256, path, content)
+                    return self._send(sha256, path, content)
         except OSError as error:
             raise StoreError(
                 f"a file cannot be read for its upload: {error.strerror or error}", where=str(path)
             ) from error
 
-    def _put(self, sha256: str, path: Path, content: bytes | mmap.mmap) -> bool:
+    def _send(self, sha256: str, path: Path, content: bytes | mmap.mmap) -> bool:
         if len(content) > MOST_BYTES:
             raise ObjectStoreError(
                 "an object store takes at most 5 GiB in one request; this file stays in the spool", where=str(path)

@@ -39,8 +39,8 @@ class Answer:
     body: bytes
 
 
-def _digest(key: bytes, words: str) -> bytes:
-    return hmac.digest(key, words.encode(), "sha256")
+def _digest(key: bytes, text: str) -> bytes:
+    return hmac.digest(key, text.encode(), "sha256")
 
 
 def signed_headers(
@@ -67,8 +67,8 @@ def signed_headers(
     scope = f"{day}/{region}/s3/aws4_request"
     to_sign = "\n".join(["AWS4-HMAC-SHA256", stamp, scope, hashlib.sha256(request.encode()).hexdigest()])
     key = f"AWS4{keys.secret_access_key}".encode()
-    for words in (day, region, "s3", "aws4_request"):
-        key = _digest(key, words)
+    for part in (day, region, "s3", "aws4_request"):
+        key = _digest(key, part)
     signature = _digest(key, to_sign).hex()
     credential = f"{keys.access_key_id}/{scope}"
     every["authorization"] = f"AWS4-HMAC-SHA256 Credential={credential}, SignedHeaders={names}, Signature={signature}"

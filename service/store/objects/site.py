@@ -30,7 +30,7 @@ class _Strict(BaseModel):
 
 
 class ObjectStoreSection(_Strict):
-    """Where the second copy of every artefact goes."""
+    """The object store that gets the second copy of every artefact."""
 
     url: str  # s3://BUCKET/PREFIX
     endpoint: str  # https://HOST[:PORT]
@@ -62,13 +62,18 @@ class ObjectStoreSection(_Strict):
         """The prefix of all keys; "" for none."""
         return self._part("prefix").strip("/")
 
+    @property
+    def place(self) -> str:
+        """The name of the place in records and messages, without keys."""
+        return f"s3://{self.bucket}/{self.prefix}".rstrip("/") + f" at {self.endpoint}"
+
     def _part(self, name: str) -> str:
         found = _URL.fullmatch(self.url)
         return "" if found is None else str(found.group(name) or "")
 
 
 class SpoolSection(_Strict):
-    """When a file may leave the artefact folder, and how much of what was fetched is kept."""
+    """The time after which a file may leave the artefact folder, and the size of the cache of fetched files."""
 
     free_after_days: Days = 7.0  # since it was last written or stored again
     cache_gb: Gigabytes = 20.0

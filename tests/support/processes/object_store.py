@@ -51,6 +51,7 @@ class Weed:
                 _program(), "server", f"-dir={self._folder / 'data'}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1",
                 f"-master.port={master}", f"-volume.port={volume}", "-volume.max=200", "-master.volumeSizeLimitMB=64",
                 "-filer", f"-filer.port={filer}", "-s3", f"-s3.port={s3}", f"-s3.port.grpc={s3 + _GRPC}",
+                "-s3.port.iceberg=0", "-s3.port.lance=0",
                 f"-s3.config={self._folder / 'keys.json'}",
             ],
             stdout=log,
