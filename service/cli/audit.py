@@ -176,6 +176,13 @@ def verify_command(
     data: DataOption = DEFAULT_DATA,
     certificates: CertificatesOption = None,
     signatures: SignaturesOption = None,
+    stated_hashes: Annotated[
+        bool,
+        typer.Option(
+            "--stated-hashes",
+            help="Believe the object store's own SHA-256 of files that only it has, instead of fetching them.",
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Verify the evidence: hash every file again, follow the chain, check the signatures, and name the first fault.
@@ -187,7 +194,12 @@ def verify_command(
         with progress_bar(quiet=json) as report_progress:
             begun_s = time.monotonic()
             report = verify_with_limits(
-                data, run_id, report_progress, certificates=certificates, signatures_copy=signatures
+                data,
+                run_id,
+                report_progress,
+                certificates=certificates,
+                signatures_copy=signatures,
+                stated_hashes=stated_hashes,
             )
         _tell_the_pages(data, report, time.monotonic() - begun_s)
     if json:

@@ -25,6 +25,7 @@ from service.cli.exit_status import ExitStatus, exit_status
 from service.cli.terminal_output import Terminal, bar_of_shares
 from service.core.errors import ConfigurationError, OrthocaptureError, ProtocolError
 from service.core.shown_text import shown, shown_json, shown_lines
+from service.store.data_folder import data_folder
 
 PROGRESS_AFTER_S = 2.0
 _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
@@ -33,12 +34,23 @@ _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 console = Terminal()
 error_console = Terminal(stderr=True)
 
+
+def _data_folder(named: Path | None) -> Path | None:
+    """Return the folder that `--data` stands for: a site.yaml stands for its folder, another file is refused."""
+    if named is None:
+        return None
+    folder = data_folder(named)
+    if os.path.isfile(folder):
+        raise typer.BadParameter(f"{named} is a file: name the data folder, or its site.yaml")
+    return folder
+
+
 data_option: OptionInfo = typer.Option(
     "--data",
     envvar="ORTHOCAPTURE_DATA",
     metavar="DIR",
-    help="Folder that holds the recorded runs.",
-    file_okay=False,
+    help="Folder that holds the recorded runs, or its site.yaml.",
+    callback=_data_folder,
 )
 json_option: OptionInfo = typer.Option("--json", help="Print the result as JSON, for other programs.")
 

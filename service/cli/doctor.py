@@ -45,7 +45,10 @@ from service.store.database.opening import has_database
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import Clock, DurableFiles, SystemClock
 from service.store.mounts import why_unsafe
+from service.store.objects.opening import open_objects
+from service.store.objects.probe import ProbeResult, probe
 from service.store.signatures.second_place import SecondPlace
+from service.store.site import load_site
 from service.store.store import Store
 
 # Optional libraries, which lack wheels for some Pythons and machines, and what is not possible without them.
@@ -83,8 +86,10 @@ def doctor_command(
         free_bytes = shutil.disk_usage(existing).free
         unsafe = why_unsafe(existing)
         place = _second_place(rig_file, data)
+        objects = _object_store(data)
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
+    healthy = healthy and not any(tried.problem for tried in objects)
     healthy = healthy and not unsafe and (space is None or space.verdict == "enough") and not place.get("problem")
     clock = host_clock()
     missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
@@ -102,6 +107,7 @@ def doctor_command(
                 "host_clock": found_clock,
                 "missing": missing,
                 "second_place": place or None,
+                "object_store": {tried.name: tried.problem or "ok" for tried in objects} or None,
             }
         )
     else:
@@ -116,8 +122,20 @@ def doctor_command(
             console.print(
                 f"second place of the signatures {place['path']}: {place['problem'] or 'up to date'}", markup=False
             )
+        for tried in objects:
+            mark = ("!", "bold red") if tried.problem else ("✓", "bold green")
+            console.tell(mark, f" object store: {tried.name}", f": {tried.problem}" if tried.problem else "")
     if not healthy:
         raise typer.Exit(ExitStatus.FAILED)
+
+
+def _object_store(data: Path) -> list[ProbeResult]:
+    """Probe the object store that the site's file names; nothing without one."""
+    site = load_site(data)
+    if site is None or site.object_store is None:
+        return []
+    clock = SystemClock()
+    return probe(open_objects(data, site.object_store, clock), clock, lock_days=site.object_store.lock_days)
 
 
 def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | OrthocaptureError]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
@@ -31,8 +31,12 @@ from service.run_record import open_jobs, results_to_come
 from service.run_start import recorded_run
 from service.steps.coats import coats
 from service.steps.live_numbers import describe_view
+from service.store.data_folder import SITE_FILE
 from service.store.durable_effects import moment_of
 from service.store.store import Store
+
+if TYPE_CHECKING:
+    from service.store.objects.upload import UploadState
 
 
 def status_command(
@@ -48,6 +52,7 @@ def status_command(
         state, missing = log.state, [left.text for left in results_to_come(log)]
         computing = open_jobs(log)
         aging = coats(protocol, state, moment_of(store.clock))
+        uploading = _uploading(store)
     if json:
         ways = [asdict(way) for way in ways_on(protocol, state)]
         about = None if root.about is None else root.about.model_dump()
@@ -58,6 +63,7 @@ def status_command(
             "still_to_come": missing,
             "open_jobs": jobs,
             "coats": aged,
+            **({} if uploading is None else {"object_store": asdict(uploading)}),
         }
         print_json(status_record(run_id, state) | told | {"ways_on": ways})
         return
@@ -89,8 +95,18 @@ def status_command(
     for way in ways_on(protocol, state):
         can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
         console.print(f"way on: {way.verb} {way.step}: {way.words}; {can}")
-    for deviation in state.deviations:
-        console.print(f"deviation: {deviation.text}")
+    lines = [f"deviation: {deviation.text}" for deviation in state.deviations]
+    for line in lines if uploading is None else [*lines, f"object store: {uploading.sentence}"]:
+        console.print(line)
+
+
+def _uploading(store: Store) -> UploadState | None:
+    """Return what waits for the site's object store; None without a site.yaml, which nothing else is read for."""
+    if not (store.database_path.parent / SITE_FILE).is_file():
+        return None
+    from service.store.objects.upload import upload_state  # noqa: PLC0415 - for sites only
+
+    return upload_state(store)
 
 
 _STANDINGS: dict[Standing, str] = {

@@ -19,6 +19,7 @@ from service.cli.common import (
     require_writable_folder,
 )
 from service.cli.exit_status import ExitStatus
+from service.cli.object_store import gc_spool, upload_command
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.core.text.words import counted
 from service.core.units import gigabytes
@@ -215,6 +216,7 @@ def store() -> None:
 store_app.command("backup")(backup_command)
 store_app.command("restore")(restore_command)
 store_app.command("rebuild")(rebuild_command)
+store_app.command("upload")(upload_command)
 
 
 @store_app.command("prepare")
@@ -276,15 +278,22 @@ def gc_command(
     min_age_min: Annotated[
         float, typer.Option("--min-age-min", min=0, help="Keep files younger than this many minutes.")
     ] = USUAL_AGE_S / 60,
+    spool: Annotated[
+        bool, typer.Option("--spool", help="Instead, free recorded files that the object store has confirmed.")
+    ] = False,
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """List files left by crashes, to which no record refers. With --remove, remove them and record the removal.
 
-    Recorded files are never touched, nor are files that a running process may still record.
+    Recorded files are never touched, nor are files that a running process may still record. With --spool, the same
+    for recorded files of ended runs that the site's object store has confirmed and states at that moment.
     """
     with reporting_errors(json), Store.open(data, create=False) as opened:
+        if spool:
+            gc_spool(opened, remove=remove, json=json)
+            return
         age_s = 60 * min_age_min
         gone = []
         if remove:

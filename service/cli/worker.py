@@ -30,6 +30,7 @@ from service.core.text.words import counted
 from service.logs.file_log import file_log
 from service.store.access import kept_to
 from service.worker.pool import work_side_by_side
+from service.worker.uploading import uploading
 
 
 def worker_command(
@@ -56,7 +57,13 @@ def worker_command(
         stopped = True
 
     signal.signal(signal.SIGTERM, on_terminate)
-    with reporting_errors(json), kept_to(data), file_log(data, "worker"), progress_bar(quiet=json) as progress:
+    with (
+        reporting_errors(json),
+        kept_to(data),
+        file_log(data, "worker"),
+        uploading(data),
+        progress_bar(quiet=json) as progress,
+    ):
         cluster = reached_scheduler(
             scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
         )

@@ -9,10 +9,10 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, func, insert, select
 
-from service.core.errors import StoreError
+from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import RecordCopied
 from service.store.access import KEYS
-from service.store.artefacts import ArtefactFiles, chunks_of, relative_path
+from service.store.artefacts import ArtefactFiles, chunks_of
 from service.store.backup.folder import folder_errors
 from service.store.database.opening import open_read_only
 from service.store.database.tables import (
@@ -30,6 +30,7 @@ from service.store.database.tables import (
 from service.store.durable_effects import DurableFiles, Files, RandomIds
 from service.store.event_index import EventToIndex, index_events, plain_payload
 from service.store.events import canonical, sha256_text
+from service.store.objects.reading import ArtefactReader
 from service.store.records import SITE
 from service.store.runs import defer_references
 from service.store.signatures.log import NAME as LOG_NAME
@@ -136,22 +137,18 @@ def _require_no_record(store: Store) -> None:
 
 def _copy_files(reading: Connection, source: Path, store: Store, progress: Progress | None) -> tuple[list[str], int]:
     """Copy all files that the record refers to; return what the source lacks, and how many were copied."""
-    origin = ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds())
+    origin = ArtefactReader(source, ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds()))
     named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
     sizes = {row.sha256: int(row.size_bytes) for row in reading.execute(named)}
     missing: list[str] = []
     done = 0
     for sha256, size in sizes.items():
-        path = origin.folder / relative_path(sha256)
-        if not path.is_file():
-            missing.append(f"{path}: missing in the source")
+        try:
+            path = origin.path(sha256, verify=True)
+        except IntegrityError as error:
+            missing.append(f"{error.where}: {error.what}")
         else:
-            try:
-                store.put_file(path, kind="copy", media_type="application/octet-stream", sha256=sha256)
-            except StoreError as error:
-                if "changed in transfer" not in error.what:
-                    raise
-                missing.append(f"{path}: altered in the source")
+            store.put_file(path, kind="copy", media_type="application/octet-stream", sha256=sha256)
         done += size
         if progress is not None:
             progress("copying files", done, sum(sizes.values()))

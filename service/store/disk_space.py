@@ -30,6 +30,7 @@ _LOOKED_AT = 30  # newest runs among which one of the same protocol with photogr
 _REMOVABLE: Mapping[str, str] = {
     "exports": "exports that were copied elsewhere",
     "logs": "logs",
+    "fetched": "copies of files that the object store holds",
     "artefacts/tmp": "remains of interrupted writes",
 }
 _WORTH_SAYING_BYTES = 1_000_000

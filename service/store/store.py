@@ -26,6 +26,7 @@ from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Ages, Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.events import append, read_events, to_event
 from service.store.mounts import require_own_mount
+from service.store.objects.reading import ArtefactReader
 from service.store.records import (
     SITE,
     Artefact,
@@ -74,6 +75,7 @@ class Store:
     ) -> None:
         self._database = database
         self._folder = folder
+        self._reader = ArtefactReader(path.parent, folder)
         self._files = files
         self._clock = clock
         self._ids = ids
@@ -178,11 +180,11 @@ class Store:
         )
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """Return the read-only file of an artefact.
+        """Return the read-only file of an artefact; one that was freed here is fetched from the site's object store.
 
         Raises IntegrityError if it is missing or, with `verify`, altered.
         """
-        return self._folder.verified_path(sha256) if verify else self._folder.path(sha256)
+        return self._reader.path(sha256, verify=verify)
 
     # --- runs and events ---
 

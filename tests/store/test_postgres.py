@@ -414,7 +414,7 @@ def test_a_file_that_the_source_lost_is_told_and_the_rest_is_copied(cluster: Clu
         store.artefact_path(lost).unlink()
     status, said = copied(tmp_path / "lite", cluster.site(tmp_path / "site"))
     assert status == 1
-    assert "missing in the source" in " ".join(said.split())
+    assert "a stored file is missing" in " ".join(said.split())
     assert [lost in str(fault) for fault in verify(tmp_path / "site").faults] == [True]
 
 

@@ -103,6 +103,15 @@ RUN_ELSEWHERE = {
     "orthocapture worker --data runs --scheduler tcp://head:8786": (
         "tests/cluster/test_cluster.py::test_a_worker_of_a_cluster_records_the_processors_that_computed_an_answer"
     ),
+    "orthocapture store upload --data runs": (
+        "tests/objects/test_uploads.py::test_the_command_says_what_waits_and_why"
+    ),
+    "orthocapture store gc --spool --data runs": (
+        "tests/objects/test_freed_files.py::test_the_command_lists_and_frees"
+    ),
+    "orthocapture store gc --spool --remove --data runs": (
+        "tests/objects/test_freed_files.py::test_the_command_lists_and_frees"
+    ),
     "orthocapture compare RUN OTHER --data runs": (
         "tests/audit/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
     ),
@@ -157,6 +166,9 @@ RUN_ELSEWHERE = {
     ),
     'pip install "kornia==0.9.0" "torch>=2.5.1"': (  # needs a package index, which tests have not
         "tests/matching/test_methods.py::test_a_learned_method_says_what_to_install_and_which_file_to_give"
+    ),
+    'pip install "orthocapture[site]"': (  # the same
+        "tests/objects/test_site_file.py::test_without_obstore_its_extra_is_named"
     ),
     'pip install "orthocapture[grounded]"': (  # the same
         "tests/markers/test_grounded.py::test_without_weights_the_message_names_the_files_and_their_place"

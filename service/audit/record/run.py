@@ -19,6 +19,7 @@ from service.store.artefacts import ArtefactFiles, read_artefacts
 from service.store.database.opening import open_read_only
 from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
+from service.store.objects.reading import ArtefactReader
 from service.store.records import Artefact
 from service.store.runs import read_runs, resolve_run
 
@@ -30,11 +31,12 @@ class RecordedFiles:
     """Read-only access to the files of a data folder."""
 
     def __init__(self, data_dir: Path) -> None:
-        self._files = ArtefactFiles(data_dir / "artefacts", DurableFiles(), RandomIds())
+        folder = ArtefactFiles(data_dir / "artefacts", DurableFiles(), RandomIds())
+        self._files = ArtefactReader(data_dir, folder)
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
         """Return the file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
-        return self._files.verified_path(sha256) if verify else self._files.path(sha256)
+        return self._files.path(sha256, verify=verify)
 
 
 @dataclass(frozen=True, slots=True)

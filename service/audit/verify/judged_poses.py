@@ -12,7 +12,7 @@ from service.core.errors import StoreError
 from service.core.recorded_devices import recorded_report
 from service.core.records.events import DeviceOpened, Event, ViewpointCaptured
 from service.core.text.words import counted
-from service.store.database.engine import open_read_only
+from service.store.database.opening import open_read_only
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
 from service.store.verification.verify import AuditReport, verify
@@ -39,6 +39,7 @@ def verify_with_limits(
     certificates: Path | None = None,
     files: bool = True,
     signatures_copy: Path | None = None,
+    stated_hashes: bool = False,
 ) -> AuditReport:
     """Verify as `verify` does, and note how many views are not judged. A record with faults is not read for that.
 
@@ -47,7 +48,13 @@ def verify_with_limits(
         StoreError: there is no database, or it cannot be read.
     """
     report = verify(
-        data_dir, run_id, progress, certificates=certificates, files=files, signatures_copy=signatures_copy
+        data_dir,
+        run_id,
+        progress,
+        certificates=certificates,
+        files=files,
+        signatures_copy=signatures_copy,
+        stated_hashes=stated_hashes,
     )
     if not report.ok:
         return report

@@ -11,7 +11,7 @@ import shutil
 import socket
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from sqlalchemy import Connection, select
 from service.core.errors import IntegrityError, StoreError
 from service.core.units import gigabytes
 from service.store.access import KEYS, PEPPER
-from service.store.artefacts import chunks_of, hash_file, relative_path
+from service.store.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
 from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.opening import require_sqlite
@@ -28,6 +28,7 @@ from service.store.database.tables import artefacts, event_index, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
 from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.journal.lines import first_lines
+from service.store.objects.reading import ArtefactReader
 from service.store.signatures.checkpoints import KeyFolder, read_every_checkpoint
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
@@ -285,8 +286,7 @@ class _Backup:
         total, done = sum(sizes[sha256] for sha256 in missing), 0
         for sha256 in missing:
             source = self.data_dir / "artefacts" / relative_path(sha256)
-            fault = self._copy_file(sha256, source)
-            if fault:
+            if fault := self._copy_file(sha256, self._fetched(sha256, source)):
                 lost.append(fault)
             done += sizes[sha256]
             self.progress("copying files", done, total)
@@ -295,6 +295,15 @@ class _Backup:
             if (self.folder.artefacts.folder / shard).is_dir():
                 self.folder.files.sync_directory(self.folder.artefacts.folder / shard)
         return lost
+
+    def _fetched(self, sha256: str, source: Path) -> Path:
+        """Return a file of the data folder, or as it is fetched if only the site's object store has it."""
+        if source.exists():
+            return source
+        own = ArtefactFiles(self.data_dir / "artefacts", DurableFiles(), RandomIds())
+        with suppress(StoreError):  # then it is missing, as the copying will say
+            return ArtefactReader(self.data_dir, own).path(sha256)
+        return source
 
     def _copy_file(self, sha256: str, source: Path) -> str:
         try:

@@ -33,7 +33,7 @@ from service.store.records import RecordDamagedError, StoreVersionError
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
 _LOG = logging.getLogger(__name__)
-REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006")  # of migrations/versions, in order
+REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006", "0007")  # of migrations/versions, in order
 RESTORE = (
     "`orthocapture store rebuild` restores a damaged database from its journal; or restore the folder from a copy"
 )

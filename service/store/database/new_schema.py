@@ -513,4 +513,23 @@ STATEMENTS: tuple[str, ...] = (
         "event_facets WHERE run_id = NEW.run_id AND seq = NEW.seq AND name = NEW.name) BEGIN SELECT "
         "RAISE(ABORT, 'event_facets is append-only: replace refused'); END"
     ),
+    (
+        "CREATE TABLE copies (\n"
+        "\t"
+        "sha256 TEXT NOT NULL, \n"
+        "\t"
+        "place TEXT NOT NULL, \n"
+        "\t"
+        "size_bytes INTEGER NOT NULL, \n"
+        "\t"
+        "at_utc TEXT NOT NULL, \n"
+        "\t"
+        "checked_utc TEXT NOT NULL, \n"
+        "\t"
+        "PRIMARY KEY (sha256, place)\n"
+        ")\n"
+        " "
+        "STRICT\n"
+        "\n"
+    ),
 )

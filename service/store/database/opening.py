@@ -5,16 +5,29 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.core.errors import StoreError
+from service.store.data_folder import SITE_FILE
 from service.store.database import engine
 from service.store.database.database import PATIENCE_S, Database
 from service.store.database.postgres import open_postgres
 from service.store.durable_effects import Files
-from service.store.site import SITE_FILE, load_site
+
+
+def named_database(data_dir: Path) -> str | None:
+    """Return the address of the database that a folder's site.yaml names; None for SQLite.
+
+    Raises ConfigurationError.
+    """
+    if not (data_dir / SITE_FILE).is_file():
+        return None
+    from service.store.site import load_site  # noqa: PLC0415 - for sites only
+
+    site = load_site(data_dir)
+    return None if site is None else site.database
 
 
 def has_database(data_dir: Path) -> bool:
     """Return whether a folder is a data folder: it has a database, or names one. Raises ConfigurationError."""
-    return engine.database_path(data_dir).is_file() or load_site(data_dir).database is not None
+    return engine.database_path(data_dir).is_file() or named_database(data_dir) is not None
 
 
 def require_database(data_dir: Path) -> None:
@@ -29,7 +42,7 @@ def require_database(data_dir: Path) -> None:
 
 def require_sqlite(data_dir: Path) -> None:
     """Raise StoreError if the record of a data folder is in PostgreSQL, which has tools of its own for this."""
-    if load_site(data_dir).database is not None:
+    if named_database(data_dir) is not None:
         raise StoreError(
             "the record of this site is in PostgreSQL",
             where=str(data_dir / SITE_FILE),
@@ -46,7 +59,7 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
         RecordDamagedError: it is not the one that the journal describes.
         StoreError: the folder has a database and names another.
     """
-    url = load_site(data_dir).database
+    url = named_database(data_dir)
     if url is None:
         return engine.open_database(data_dir, files, patience_s)
     _require_one(data_dir)
@@ -55,7 +68,7 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
 
 def open_read_only(data_dir: Path, files: Files) -> Database:
     """Open an existing database for reading. Raises StoreError if there is none, or as `open_database`."""
-    url = load_site(data_dir).database
+    url = named_database(data_dir)
     if url is None:
         return engine.open_read_only(data_dir, files)
     _require_one(data_dir)

@@ -8,10 +8,10 @@ from sqlalchemy import Connection, text
 
 from service.store.database.tables import metadata
 
-REVISION = "0006"  # as of the migrations: a database that was prepared by an earlier one is upgraded by them
+REVISION = "0007"  # as of the migrations: a database that was prepared by an earlier one is upgraded by them
 EVIDENCE = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index", "event_facets", "event_words")
 _ENDS = ("heads",)  # inserted and moved, never removed
-_OF_THE_MOMENT = ("jobs", "leases", "accounts", "invitations", "sessions", "control")
+_OF_THE_MOMENT = ("jobs", "leases", "accounts", "invitations", "sessions", "control", "copies")
 _REFUSAL = """
 BEGIN
   RAISE EXCEPTION '% is append-only: % refused', TG_TABLE_NAME, lower(TG_OP);

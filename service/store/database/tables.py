@@ -260,3 +260,16 @@ control = Table(
     Column("asked_utc_s", _REAL, nullable=False),  # negative: that was refused, at the time without the sign
     sqlite_strict=True,
 )
+
+# Which artefacts another place holds: each row was confirmed by that place's own statement, and can be again.
+copies = Table(
+    "copies",
+    metadata,
+    Column("sha256", _TEXT, nullable=False),
+    Column("place", _TEXT, nullable=False),
+    Column("size_bytes", _INTEGER, nullable=False),
+    Column("at_utc", _TEXT, nullable=False),  # when it was first confirmed
+    Column("checked_utc", _TEXT, nullable=False),  # when it was last confirmed
+    PrimaryKeyConstraint("sha256", "place"),
+    sqlite_strict=True,
+)

@@ -16,6 +16,7 @@ from service.store.journal.lines import RowImage, Value
 KEPT = ("runs", "events", "artefacts", "jobs", "checkpoints", "timestamps", "accounts", "invitations")
 DERIVED = ("event_index", "event_facets", "heads")  # made again from the events
 PRESENT_STATE = ("leases", "sessions", "control")  # of processes and screens of the moment
+STATED_ELSEWHERE = ("copies",)  # by the place itself, which is asked again
 _KEYS = {name: tuple(column.name for column in metadata.tables[name].primary_key.columns) for name in KEPT}
 _COLUMNS = {name: tuple(column.name for column in metadata.tables[name].columns) for name in KEPT}
 _MOST_KEYS = max(map(len, _KEYS.values()))

@@ -27,6 +27,7 @@ from service.store.journal import changes
 from service.store.journal.findings import Survey, committed_rows, journal_findings, survey
 from service.store.journal.journal import Journal
 from service.store.journal.lines import NAME, first_lines
+from service.store.objects.elsewhere import not_elsewhere
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -274,6 +275,9 @@ def _missing_files(data_dir: Path, work: Path) -> Iterator[str]:
     with closing(sqlite3.connect(database_path(work))) as connection:
         named = connection.execute("SELECT DISTINCT sha256, original_name FROM artefacts ORDER BY sha256").fetchall()
     gone = [(sha, name) for sha, name in named if not (data_dir / "artefacts" / relative_path(str(sha))).is_file()]
+    if gone:
+        lost = set(not_elsewhere(data_dir, [str(sha) for sha, _name in gone]))
+        gone = [(sha, name) for sha, name in gone if str(sha) in lost]
     for sha256, name in gone[:_MOST_NAMED]:
         yield f"the file {name} is missing (artefacts/{relative_path(str(sha256))})"
     if len(gone) > _MOST_NAMED:

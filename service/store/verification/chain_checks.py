@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
 from pydantic_core import ValidationError
 
@@ -51,12 +51,16 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class FileState:
-    """The result of hashing a recorded file again; `problem` is "" if it could be read."""
+    """The result of checking a recorded file again; `problem` is "" if it could be read.
+
+    `how` says what was hashed: the file in this folder, what the object store sent, or nothing (its own statement).
+    """
 
     shown: str
     sha256: str
     size: int
     problem: str
+    how: Literal["here", "fetched", "stated"] = "here"
 
 
 @dataclass

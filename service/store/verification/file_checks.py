@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from service.core.errors import StoreError
 from service.store.artefacts import TEMPORARY, hash_file, relative_path
@@ -13,22 +13,33 @@ from service.store.verification.chain_checks import Fault, FileState
 Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
 
 
+class Elsewhere(Protocol):
+    """Another place that may have a file that is not in the folder."""
+
+    def state(self, sha256: str, shown: str) -> FileState:
+        """Return what is found of a file there; its `problem` says why nothing was."""
+        ...
+
+
 def hash_files(
-    folder: Path, artefact_rows: Iterable[Mapping[str, Any]], progress: Progress | None
+    folder: Path,
+    artefact_rows: Iterable[Mapping[str, Any]],
+    progress: Progress | None,
+    elsewhere: Elsewhere | None = None,
 ) -> dict[str, FileState]:
-    """Hash every file that the rows name, by its recorded SHA-256."""
+    """Hash every file that the rows name, by its recorded SHA-256; one that is not here is looked for elsewhere."""
     wanted = {str(row["sha256"]): int(row["size_bytes"]) for row in artefact_rows}
     total, done = sum(wanted.values()), 0
     states: dict[str, FileState] = {}
     for sha256, size in wanted.items():
-        states[sha256] = _file_state(folder, sha256)
+        states[sha256] = _file_state(folder, sha256, elsewhere)
         done += size
         if progress is not None:
             progress("hashing files again", done, total)
     return states
 
 
-def _file_state(folder: Path, sha256: str) -> FileState:
+def _file_state(folder: Path, sha256: str, elsewhere: Elsewhere | None) -> FileState:
     try:
         name = relative_path(sha256)
     except StoreError:
@@ -36,12 +47,30 @@ def _file_state(folder: Path, sha256: str) -> FileState:
     path = folder / name
     shown = str(Path(folder.name) / name)
     if path.is_symlink() or not path.is_file():
+        if elsewhere is not None and not path.is_symlink() and not path.exists():
+            return elsewhere.state(sha256, shown)
         return FileState(shown, "", 0, "the file is missing")
     try:
         digest, size = hash_file(path)
     except OSError as error:
         return FileState(shown, "", 0, f"the file cannot be read: {error.strerror}")
     return FileState(shown, digest, size, "")
+
+
+def elsewhere_notes(states: Iterable[FileState]) -> list[str]:
+    """Return notes on the files that are not in the folder, by how each was checked; none if all are here."""
+    found = list(states)
+    read = sum(state.how == "fetched" and not state.problem for state in found)
+    stated = sum(state.how == "stated" and not state.problem for state in found)
+    only = "in the object store alone"
+    notes: list[str] = []
+    if read:
+        notes.append(f"{read} of {len(found)} files are {only}: their content was fetched and hashed")
+    if stated:
+        notes.append(
+            f"{stated} of {len(found)} files are {only} and were NOT read: the store itself states their SHA-256"
+        )
+    return notes
 
 
 def unlisted_files(folder: Path, listed: frozenset[str]) -> tuple[list[str], list[Fault]]:

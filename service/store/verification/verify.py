@@ -18,6 +18,7 @@ from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
 from service.store.journal.findings import journal_findings
+from service.store.objects.elsewhere import files_elsewhere
 from service.store.records import SITE, Artefact, RunRow, UnknownRunError
 from service.store.runs import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
@@ -29,7 +30,7 @@ from service.store.verification import postgres_checks, search_checks
 from service.store.verification import signature_checks as signatures
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
 from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
-from service.store.verification.file_checks import Progress, hash_files, unlisted_files
+from service.store.verification.file_checks import Elsewhere, Progress, elsewhere_notes, hash_files, unlisted_files
 from service.store.verification.people_checks import people_faults
 
 
@@ -88,6 +89,7 @@ def verify(
     certificates: Path | None = None,
     files: bool = True,
     signatures_copy: Path | None = None,
+    stated_hashes: bool = False,
 ) -> AuditReport:
     """Check the chain, hash every file again and check every signature, of one run or of all.
 
@@ -101,18 +103,20 @@ def verify(
         certificates: PEM file of the time-stamp authorities. Without it, only the stamped content is checked.
         files: False skips the files; a note says so.
         signatures_copy: a copy of the log of signatures from elsewhere, which shows whether the log was cut.
+        stated_hashes: take the object store's own SHA-256 of files that only it has, instead of fetching them.
 
     Raises:
         UnknownRunError: there is no such run.
         StoreError: there is no database, or it cannot be read.
     """
     of_wal, notes_of_wal = wal_findings(data_dir)  # of SQLite; a server has no such file here
+    away = files_elsewhere(data_dir, stated_hashes=stated_hashes) if files else None
     database = open_read_only(data_dir, DurableFiles())
     try:
         # Before the database's snapshot: a signature made meanwhile is in the database first, and then in the log.
         lines = read_log(data_dir / LOG_NAME)
         with database.reading() as connection, _damage_named(data_dir, connection):
-            report = _verify(data_dir, connection, lines, run_id, progress, certificates, with_files=files)
+            report = _verify(data_dir, connection, lines, run_id, progress, certificates, away, with_files=files)
             runs = None if run_id is None else [run_id]
             of_journal, notes_of_journal = (
                 ([], [])
@@ -154,13 +158,14 @@ def _verify(
     run_id: str | None,
     progress: Progress | None,
     certificates: Path | None,
+    away: Elsewhere | None,
     *,
     with_files: bool,
 ) -> AuditReport:
     evidence = read_evidence(connection, run_id)
     folder = data_dir / "artefacts"
     artefact_rows = (row for rows in evidence.artefacts.values() for row in rows)
-    files = hash_files(folder, artefact_rows, progress) if with_files else None
+    files = hash_files(folder, artefact_rows, progress, away) if with_files else None
     chains, found = _check_chains(connection, evidence, files)
     site = chains[SITE]
     keys = signatures.key_history(site, evidence.checkpoints[SITE])
@@ -175,6 +180,7 @@ def _verify(
     orphans, foreign = unlisted_files(folder, evidence.every_sha256) if with_files else ([], [])
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
+    notes += elsewhere_notes((files or {}).values())
     of_log, said_of_log = _log_findings(lines, evidence, site, keys, run_id)
     every_run = run_id is None
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
@@ -285,7 +291,7 @@ def _counted(
         events=sum(events.values()),
         artefacts=sum(len(evidence.artefacts.get(run, [])) for run in evidence.run_ids),
         files=len(files),
-        bytes_hashed=sum(state.size for state in files.values()),
+        bytes_hashed=sum(state.size for state in files.values() if state.how != "stated"),
         jobs=sum(len(evidence.jobs.get(run, [])) for run in evidence.run_ids),
         checkpoints=sum(len(signed[run]) for run in evidence.run_ids),
         timestamps=sum(len(evidence.timestamps[run]) for run in evidence.run_ids),

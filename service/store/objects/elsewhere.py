@@ -1,0 +1,60 @@
+"""The search for files in the site's object store that are not in the artefact folder, for those who verify."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from service.store.data_folder import SITE_FILE
+from service.store.objects.interface import ObjectStore, ObjectStoreError
+from service.store.verification.chain_checks import FileState
+
+_MISSING = "the file is missing"
+
+
+class FilesElsewhere:
+    """The files of an object store, each read whole or, with `stated_hashes`, known by the store's own statement."""
+
+    def __init__(self, objects: ObjectStore, *, stated_hashes: bool) -> None:
+        self._objects = objects
+        self._stated_hashes = stated_hashes
+
+    def state(self, sha256: str, shown: str) -> FileState:
+        """Return what the object store has of a file; its `problem` says why it has nothing."""
+        named = f"{shown} (in {self._objects.place})"
+        try:
+            stated = self._objects.stat(sha256)
+            if stated is None:
+                return FileState(shown, "", 0, f"{_MISSING}, here and in the object store")
+            if self._stated_hashes:
+                problem = (
+                    "" if stated.sha256 else "the file is not here, and the object store states no SHA-256 of it"
+                )
+                return FileState(named, stated.sha256, stated.size_bytes, problem, "stated")
+            digest, size = hashlib.sha256(), 0
+            for chunk in self._objects.chunks(sha256):
+                digest.update(chunk)
+                size += len(chunk)
+        except ObjectStoreError as error:
+            return FileState(shown, "", 0, f"{_MISSING} here, and {error.what}", "fetched")
+        return FileState(named, digest.hexdigest(), size, "", "fetched")
+
+
+def files_elsewhere(data_dir: Path, *, stated_hashes: bool = False) -> FilesElsewhere | None:
+    """Return the files of a site's object store; None for a data folder without one. Raises ConfigurationError."""
+    if not (data_dir / SITE_FILE).is_file():
+        return None
+    from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
+    from service.store.site import load_site  # noqa: PLC0415 - for sites only
+
+    site = load_site(data_dir)
+    if site is None or site.object_store is None:
+        return None
+    return FilesElsewhere(open_objects(data_dir, site.object_store), stated_hashes=stated_hashes)
+
+
+def not_elsewhere(data_dir: Path, names: Iterable[str]) -> list[str]:
+    """Return the hashes of those files that no object store states to have. Raises ConfigurationError."""
+    away = files_elsewhere(data_dir, stated_hashes=True)
+    return [name for name in names if away is None or away.state(name, "").sha256 != name]

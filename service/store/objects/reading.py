@@ -1,0 +1,111 @@
+"""Reading an artefact wherever it is: in the spool, in the cache of fetched files, or in the object store."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from service.core.errors import ConfigurationError, IntegrityError, StoreError
+from service.core.units import bytes_of_gigabytes
+from service.store.access import folder_mode, make_folder
+from service.store.artefacts import ArtefactFiles, hash_file, relative_path
+from service.store.data_folder import SITE_FILE
+from service.store.objects.interface import ObjectStoreError
+
+if TYPE_CHECKING:
+    from service.store.objects.s3 import S3Objects
+
+FETCHED = "fetched"  # beside the artefacts; nothing of it is evidence
+_YOUNG_S = 3600.0  # what was used since may still be read
+_PART = ".part"
+
+
+class ArtefactReader:
+    """Gives the files of a data folder to readers. Without a site.yaml it does what the artefact folder does."""
+
+    def __init__(self, data_dir: Path, folder: ArtefactFiles) -> None:
+        self._data = data_dir
+        self._folder = folder
+        self._objects: S3Objects | None = None
+        self._most_bytes = 0.0
+
+    def path(self, sha256: str, *, verify: bool = False) -> Path:
+        """Return the file of a recorded artefact: from the spool, else as it was fetched from the object store.
+
+        What is fetched is hashed when it arrives, with `verify` at each call. Raises IntegrityError if the file is
+        altered, or missing wherever it could be.
+        """
+        try:
+            return self._folder.verified_path(sha256) if verify else self._folder.path(sha256)
+        except IntegrityError as missing:
+            if (self._folder.folder / relative_path(sha256)).exists() or not self._has_store():
+                raise
+            return self._fetched(sha256, missing, verify=verify)
+
+    def _has_store(self) -> bool:
+        if self._objects is None and (self._data / SITE_FILE).is_file():
+            from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
+            from service.store.site import load_site  # noqa: PLC0415 - for sites only
+
+            site = load_site(self._data)
+            if site is not None and site.object_store is not None:
+                self._objects = open_objects(self._data, site.object_store)
+                self._most_bytes = bytes_of_gigabytes(site.spool.cache_gb)
+        return self._objects is not None
+
+    def _fetched(self, sha256: str, missing: IntegrityError, *, verify: bool) -> Path:
+        target = self._data / FETCHED / relative_path(sha256)
+        try:
+            if target.is_file():
+                os.utime(target)
+                if not verify or hash_file(target)[0] == sha256:
+                    return target
+                target.unlink(missing_ok=True)  # it is only a copy: another one is fetched
+            self._fetch(sha256, target)
+        except (ObjectStoreError, ConfigurationError) as error:
+            raise IntegrityError(
+                f"{missing.what}, and {error.what}", where=f"{missing.where}; {error.where}", remedy=missing.remedy
+            ) from error
+        except OSError as error:
+            raise StoreError(
+                f"a fetched file cannot be stored: {error.strerror or error}",
+                where=str(error.filename or target),
+                remedy="Look at the disk of the data folder; the object store has the file",
+            ) from error
+        return target
+
+    def _fetch(self, sha256: str, target: Path) -> None:
+        assert self._objects is not None
+        for folder in (target.parent.parent, target.parent):
+            make_folder(folder, folder_mode(folder.parent))
+        part = target.with_name(f"{secrets.token_hex(8)}{_PART}")
+        try:
+            self._objects.fetch(sha256, part)
+            part.chmod(part.stat().st_mode & 0o444)
+            descriptor = os.open(part, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                os.fsync(descriptor)  # a name must not come before its content
+            finally:
+                os.close(descriptor)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+        self._make_room(target)
+
+    def _make_room(self, but: Path) -> None:
+        """Remove the files that were not used for longest while the cache is too large; never those in use now."""
+        held: list[tuple[float, int, Path]] = []
+        for path in (self._data / FETCHED).glob("*/*"):
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                continue
+            held.append((status.st_mtime, status.st_size, path))
+        size_bytes, newest_s = sum(size for _, size, _ in held), but.stat().st_mtime
+        for used_s, size, path in sorted(held):
+            if size_bytes <= self._most_bytes or newest_s - used_s < _YOUNG_S:
+                return
+            path.unlink(missing_ok=True)
+            size_bytes -= size
