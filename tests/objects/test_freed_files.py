@@ -17,6 +17,7 @@ from service.cli.main import app
 from service.core.errors import IntegrityError
 from service.store.backup.backup import back_up
 from service.store.backup.restore import restore
+from service.store.journal.rebuild import rebuild
 from service.store.objects.freeing import free_spool, spool_files
 from service.store.objects.s3 import S3Objects
 from service.store.objects.upload import Uploader
@@ -197,3 +198,18 @@ def test_without_a_site_file_nothing_is_asked(tmp_path: Path) -> None:
             store.artefact_path(name)
     assert not (tmp_path / "data" / "fetched").exists()
     assert any(fault.what.startswith("the file is missing (") for fault in verify(tmp_path / "data").faults)
+
+
+def test_a_rebuilt_database_misses_no_freed_file_and_the_store_is_asked_again(weed: Weed, tmp_path: Path) -> None:
+    store, bench, objects = uploaded(weed, tmp_path)
+    with store:
+        names = images(store, bench)
+        free_spool(store, objects, AT_ONCE)
+    for part in (tmp_path / "data").glob("orthocapture.sqlite*"):
+        part.unlink()
+    made = rebuild(tmp_path / "data", actor=lambda _folder: "Ada")
+    assert made.made
+    assert made.lost == ()
+    with Store.open(tmp_path / "data") as store:
+        assert Uploader(store, objects).drain() == len(names)
+        assert store.artefact_path(names[0], verify=True).is_file()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from service.cli.main import app
 from service.core.errors import IntegrityError
 from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreAwayError, ObjectStoreError
@@ -95,3 +98,17 @@ def test_a_probe_finds_a_sound_store_sound_and_one_without_locks_not(weed: Weed)
     assert [result.name for result in unlocked if result.problem] == ["a locked object cannot be deleted"]
     refused = probe(weed.objects("ready", keys=Keys("stranger", "wrong")), SystemClock())
     assert [bool(result.problem) for result in refused] == [True]
+
+
+def test_the_doctor_names_what_it_tried_and_what_failed(weed: Weed, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("name: bare\nsimulated: true\ndevices: {}\n")
+    data = tmp_path / "data"
+    weed.write_site(data)
+    arguments = ["doctor", "--rig", str(tmp_path / "rig.yaml"), "--data", str(data), "--json"]
+    sound = json.loads(CliRunner().invoke(app, arguments, catch_exceptions=False).output)
+    assert set(sound["object_store"].values()) == {"ok"}
+    assert "a second put of other bytes loses" in sound["object_store"]
+    (data / "store_keys.yaml").write_text("{access_key_id: stranger, secret_access_key: wrong}")
+    refused = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert refused.exit_code == 1
+    assert "refused" in json.loads(refused.output)["object_store"]["a new object is stored"]

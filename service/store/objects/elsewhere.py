@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import cache, partial
 from pathlib import Path
 
 from service.store.data_folder import SITE_FILE
@@ -16,15 +17,19 @@ _MISSING = "the file is missing"
 class FilesElsewhere:
     """The files of an object store, each read whole or, with `stated_hashes`, known by the store's own statement."""
 
-    def __init__(self, objects: ObjectStore, *, stated_hashes: bool) -> None:
-        self._objects = objects
+    def __init__(self, opened: Callable[[], ObjectStore], *, stated_hashes: bool) -> None:
+        self._opened = cache(opened)  # when the first file is not here, and not before
         self._stated_hashes = stated_hashes
 
     def state(self, sha256: str, shown: str) -> FileState:
-        """Return what the object store has of a file; its `problem` says why it has nothing."""
-        named = f"{shown} (in {self._objects.place})"
+        """Return what the object store has of a file; its `problem` says why it has nothing.
+
+        Raises ConfigurationError if the store cannot be used at all: its keys are missing, say.
+        """
+        objects = self._opened()
+        named = f"{shown} (in {objects.place})"
         try:
-            stated = self._objects.stat(sha256)
+            stated = objects.stat(sha256)
             if stated is None:
                 return FileState(shown, "", 0, f"{_MISSING}, here and in the object store")
             if self._stated_hashes:
@@ -33,7 +38,7 @@ class FilesElsewhere:
                 )
                 return FileState(named, stated.sha256, stated.size_bytes, problem, "stated")
             digest, size = hashlib.sha256(), 0
-            for chunk in self._objects.chunks(sha256):
+            for chunk in objects.chunks(sha256):
                 digest.update(chunk)
                 size += len(chunk)
         except ObjectStoreError as error:
@@ -51,7 +56,7 @@ def files_elsewhere(data_dir: Path, *, stated_hashes: bool = False) -> FilesElse
     site = load_site(data_dir)
     if site is None or site.object_store is None:
         return None
-    return FilesElsewhere(open_objects(data_dir, site.object_store), stated_hashes=stated_hashes)
+    return FilesElsewhere(partial(open_objects, data_dir, site.object_store), stated_hashes=stated_hashes)
 
 
 def not_elsewhere(data_dir: Path, names: Iterable[str]) -> list[str]:
