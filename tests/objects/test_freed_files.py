@@ -155,7 +155,6 @@ def test_the_audit_counts_how_freed_files_were_checked(weed: Weed, tmp_path: Pat
     assert any("NOT read" in note for note in stated["notes"])
 
 
-@pytest.mark.slow
 def test_bundle_and_backup_hold_freed_files(weed: Weed, tmp_path: Path) -> None:
     store, bench, objects = uploaded(weed, tmp_path)
     with store:

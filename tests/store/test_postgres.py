@@ -239,6 +239,7 @@ with Store.open(Path(sys.argv[1]), create=False) as store:
 """
 
 
+@pytest.mark.slow
 def test_writers_of_one_chain_wait_for_one_another(site: Path) -> None:
     run_id = fill(site)
     command = [sys.executable, "-c", WRITER, str(site), run_id, "40"]
@@ -271,6 +272,7 @@ def test_every_job_is_claimed_once(site: Path) -> None:
     assert len(claimed) == len(set(claimed)) == 41, "and the one that fill() left"
 
 
+@pytest.mark.slow
 def test_nothing_that_was_acknowledged_is_lost_when_the_server_dies(tmp_path: Path) -> None:
     cluster = Cluster(Path("/tmp") / f"oc-killed-{tmp_path.parent.name}")
     cluster.start()
