@@ -19,6 +19,7 @@ import numpy as np
 from service.core.errors import ConfigurationError, DataError
 from service.core.units import megabytes
 from service.machine.executors import Place, this_place
+from service.machine.resources import keep_freed_memory
 
 _DECIDES = ("compute", "core", "machine")  # the rooms of the service whose source decides a task's result
 _LARGEST_BYTES = 1_000_000  # of a task's arguments: larger ones belong into a file
@@ -78,9 +79,16 @@ def compute_there(task: RemoteTask) -> RemoteResult:
         raise version_error(place.host, differing)
     for needed in task.files:
         _require(needed, place.host)
+    _prepare_process()
     importlib.import_module("cv2").setNumThreads(1)  # as in the processes of the job's own machine
     call: Callable[[], Any] = pickle.loads(task.call)
     return RemoteResult(call(), place)
+
+
+@cache
+def _prepare_process() -> None:
+    """Let this process hold freed memory as a worker does: Dask has it returned at once, which costs much time."""
+    keep_freed_memory()
 
 
 @cache
