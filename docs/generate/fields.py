@@ -90,7 +90,7 @@ def field_comments(model: type[Any]) -> dict[str, str]:
 
 
 def _is_record(annotation: Any) -> bool:
-    """Whether a type is a record whose fields are listed: a model or a dataclass."""
+    """Return whether a type is a record whose fields are listed: a model or a dataclass."""
     is_class = isinstance(annotation, type)
     return is_class and (issubclass(annotation, BaseModel) or dataclasses.is_dataclass(annotation))
 

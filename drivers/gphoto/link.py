@@ -250,7 +250,7 @@ class Link:
         return self.call("Listing the settings", lambda camera: frozenset(str(n) for n, _ in camera.list_config()))
 
     def _widget(self, camera: Gphoto, name: str) -> Gphoto:
-        """Read a setting. Of a Canon that lacks one, libgphoto2 answers with nothing instead of an error."""
+        """Read a setting. Where a Canon lacks it, libgphoto2 answers with nothing instead of an error."""
         missing = DeviceRefusedError(f"the camera has no setting {name}", where=self.where, remedy=NOT_STATED)
         try:
             widget = camera.get_single_config(name)

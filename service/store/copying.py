@@ -44,7 +44,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class CopyReport:
-    """What was copied."""
+    """The result of a copy."""
 
     recorded: RecordCopied
     missing: tuple[str, ...]  # files that the source lacks, or has with other content
@@ -136,7 +136,7 @@ def _require_no_record(store: Store) -> None:
 
 
 def _copy_files(reading: Connection, source: Path, store: Store, progress: Progress | None) -> tuple[list[str], int]:
-    """Copy all files that the record refers to; return what the source lacks, and how many were copied."""
+    """Copy all files that the record refers to; return those that the source lacks, and the number copied."""
     origin = ArtefactReader(source, ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds()))
     named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
     sizes = {row.sha256: int(row.size_bytes) for row in reading.execute(named)}

@@ -111,7 +111,7 @@ def index_all(connection: Connection) -> None:
 
 
 def index_again(connection: Connection) -> None:
-    """Write facets and words of all events that have a row in the index, for tables that were made anew."""
+    """Write facets and words of all events that have a row in the index, for tables that are new."""
     for event in indexed_events(connection):
         _write_derived(
             connection, [(event.position, EventToIndex(event.run_id, event.seq, "", event.actor, event.payload))]
@@ -149,7 +149,7 @@ class IndexedEvent:
 
     @property
     def agrees(self) -> bool:
-        """Whether step, device and facets are those of the payload."""
+        """True if step, device and facets are those of the payload."""
         named = {"step": self.step, "device": self.device}
         return self.payload is None or (named == columns_of(self.payload) and self.facets == facets_of(self.payload))
 

@@ -23,7 +23,7 @@ from service.store.store import Store
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
-    """What is shown of a step_measured event."""
+    """The part of a step_measured event that is shown."""
 
     attempt: int
     measures: Mapping[str, float] = field(default_factory=dict[str, float])

@@ -86,14 +86,18 @@ def _expected_columns() -> dict[tuple[str, str], object]:
 def _expected_constraints() -> set[tuple[str, str]]:
     found: set[tuple[str, str]] = set(postgres_schema.FURTHER_CONSTRAINTS)
     for table in metadata.tables.values():
-        for one in table.constraints:
-            columns = "_".join(c.name for c in one.columns) if isinstance(one, ColumnCollectionConstraint) else ""
+        for constraint in table.constraints:
+            columns = (
+                "_".join(c.name for c in constraint.columns)
+                if isinstance(constraint, ColumnCollectionConstraint)
+                else ""
+            )
             made: dict[type, str] = {
                 PrimaryKeyConstraint: f"{table.name}_pkey",
                 ForeignKeyConstraint: f"{table.name}_{columns}_fkey",
                 UniqueConstraint: f"{table.name}_{columns}_key",
             }
-            found.add((table.name, str(one.name) if one.name else made[type(one)]))
+            found.add((table.name, str(constraint.name) if constraint.name else made[type(constraint)]))
     return found
 
 
@@ -120,7 +124,7 @@ def reference_faults(connection: Connection) -> Iterator[Fault]:
     for table in metadata.tables.values():
         for key in table.foreign_key_constraints:
             other = key.referred_table.name
-            same = " AND ".join(f"b.{one.column.name} = a.{one.parent.name}" for one in key.elements)
+            same = " AND ".join(f"b.{pair.column.name} = a.{pair.parent.name}" for pair in key.elements)
             without = f"NOT EXISTS (SELECT 1 FROM {other} AS b WHERE {same})"
             lost = connection.execute(text(f"SELECT count(*) FROM {table.name} AS a WHERE {without}")).scalar_one()
             if lost:
