@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import pytest
 
-from bench.cameras.canon_listings import transcribe
 from drivers.errors import DeviceRefusedError
 from drivers.gphoto.profiles import profile_for
 from drivers.interfaces import CameraSettings
 from simulators.canon_camera.recorded import names
+from tests.support.recorded.canon_listings import transcribe
 from tests.support.rig.gphoto_rig import gphoto_rig
 from tests.support.rig.simulator_process import simulator
 

@@ -167,9 +167,6 @@ RUN_ELSEWHERE = {
     'pip install "kornia==0.9.0" "torch>=2.5.1"': (  # needs a package index, which tests have not
         "tests/matching/test_methods.py::test_a_learned_method_says_what_to_install_and_which_file_to_give"
     ),
-    'pip install "orthocapture[site]"': (  # the same
-        "tests/objects/test_site_file.py::test_without_obstore_its_extra_is_named"
-    ),
     'pip install "orthocapture[grounded]"': (  # the same
         "tests/markers/test_grounded.py::test_without_weights_the_message_names_the_files_and_their_place"
     ),
