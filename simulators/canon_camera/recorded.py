@@ -3,8 +3,8 @@
 A recording names each property by its EOS code, with the numbers that libgphoto2 read from the body's events. They
 go back into events in the same way: numbers as four bytes, image formats as structures, texts with a closing zero.
 
-`recordings` holds what is public of real bodies, one file each, with its source; bench/cameras/canon_listings.py wrote
-them from logs of events, or from listings of settings in words.
+`recordings` holds what is public of real bodies, one file each, with its source; bench/cameras/canon_listings.py
+wrote them from logs of events, or from listings of settings in words.
 """
 
 from __future__ import annotations
