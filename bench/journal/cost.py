@@ -22,7 +22,7 @@ from unittest.mock import patch
 
 from bench.machine import RESULTS, commit, machine
 from service.core.records.events import OperatorAction
-from service.store.database.engine import Database
+from service.store.database.engine import SqliteDatabase
 from service.store.durable_effects import DurableFiles
 from service.store.store import Store
 from tests.support.record.store import capture, start_run
@@ -64,7 +64,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def _measured(work: Path, writes: int) -> dict[str, dict[str, float]]:
     """Milliseconds by kind: 10th percentile, median and 95th of the wall clock, mean of the processor."""
     with Store.open(work / "with") as with_journal:
-        with patch.object(Database, "_watched", lambda *_: None):
+        with patch.object(SqliteDatabase, "_watched", lambda *_: None):
             without = Store.open(work / "without")
             runs = {id(without): start_run(without)}
         runs[id(with_journal)] = start_run(with_journal)
@@ -80,7 +80,7 @@ def _measured(work: Path, writes: int) -> dict[str, dict[str, float]]:
         for first in range(0, writes, _ROUND):
             for name, store in (("with", with_journal), ("without", without)):
                 run_id = runs[id(store)]
-                with patch.object(Database, "_watched", lambda *_: None) if name == "without" else _as_it_is():
+                with patch.object(SqliteDatabase, "_watched", lambda *_: None) if name == "without" else _as_it_is():
                     for number in range(first, first + _ROUND):
                         event = OperatorAction(action="pause", reason=f"lunch {number}")
                         take(f"event, {name}", partial(store.record, run_id, [event], actor="Ada"))
@@ -91,7 +91,7 @@ def _measured(work: Path, writes: int) -> dict[str, dict[str, float]]:
 
 
 def _as_it_is() -> Any:
-    return patch.object(Database, "_watched", Database.__dict__["_watched"])
+    return patch.object(SqliteDatabase, "_watched", SqliteDatabase.__dict__["_watched"])
 
 
 def _sync(path: Path, take: Callable[[str, Callable[[], object]], None]) -> None:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, cast
 
@@ -129,11 +131,21 @@ def _installed(distribution: str) -> str:
 
 
 def _source() -> str:
-    service = Path(__file__).parents[1]
+    """Return a hash of the code that decides what a task computes."""
+    service = files("service")
     digest = hashlib.sha256()
-    for file in sorted(path for room in _DECIDES for path in (service / room).rglob("*.py")):
-        digest.update(file.relative_to(service).as_posix().encode() + b"\0" + file.read_bytes())
+    for room in _DECIDES:
+        for name, file in sorted(_sources(service / room, room)):
+            digest.update(name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:12]
+
+
+def _sources(folder: Traversable, name: str) -> Iterator[tuple[str, Traversable]]:
+    for one in folder.iterdir():
+        if one.is_dir():
+            yield from _sources(one, f"{name}/{one.name}")
+        elif one.name.endswith(".py"):
+            yield f"{name}/{one.name}", one
 
 
 def _paths_in(value: object) -> Iterator[Path]:

@@ -17,7 +17,7 @@ from service.core.records.events import ServiceStarted, SignInRecorded
 from service.people.person import NotSignedInError, PinRefusedError
 from service.people.sessions import People
 from service.people.tries import failed_tries, wait_after_s
-from service.store.database.engine import Database, database_path
+from service.store.database.engine import SqliteDatabase, database_path
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused
 
@@ -221,14 +221,14 @@ def test_a_screen_that_is_signed_out_while_it_locks_is_nobodys(
 ) -> None:
     token, person = office.enter("grace")
     office.clock.passed_s = IDLE_S
-    writing = Database.writing
+    writing = SqliteDatabase.writing
 
-    def after_a_sign_out(self: Database) -> AbstractContextManager[Connection]:
+    def after_a_sign_out(self: SqliteDatabase) -> AbstractContextManager[Connection]:
         monkeypatch.undo()
         office.people.sign_out(person)
         return writing(self)
 
-    monkeypatch.setattr(Database, "writing", after_a_sign_out)
+    monkeypatch.setattr(SqliteDatabase, "writing", after_a_sign_out)
     assert office.person(token, deliberate=True) is None
 
 

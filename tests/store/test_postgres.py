@@ -34,8 +34,8 @@ pytestmark = [pytest.mark.packages("postgresql"), pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    made = Cluster(Path("/tmp") / f"oc-{tmp_path_factory.mktemp('pg').name}-{tmp_path_factory.getbasetemp().name}")
+def cluster() -> Iterator[Cluster]:
+    made = Cluster()
     made.start()
     yield made
     made.stop()
@@ -274,7 +274,7 @@ def test_every_job_is_claimed_once(site: Path) -> None:
 
 @pytest.mark.slow
 def test_nothing_that_was_acknowledged_is_lost_when_the_server_dies(tmp_path: Path) -> None:
-    cluster = Cluster(Path("/tmp") / f"oc-killed-{tmp_path.parent.name}")
+    cluster = Cluster()
     cluster.start()
     site = cluster.site(tmp_path / "site")
     run_id = fill(site)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, Connection, func, select
-from sqlalchemy.dialects.sqlite import insert
+from sqlalchemy import ColumnElement, Connection, func, insert, select, update
 
 from service.core.text.words import counted
 from service.core.units import gigabytes
@@ -58,7 +57,7 @@ def _unconfirmed(place: str) -> ColumnElement[bool]:
 def read_waiting(connection: Connection, place: str) -> Waiting:
     """Return what a place has not confirmed yet, in figures."""
     each = (
-        select(artefacts.c.size_bytes.label("size"), func.min(artefacts.c.at_utc).label("at"))
+        select(func.max(artefacts.c.size_bytes).label("size"), func.min(artefacts.c.at_utc).label("at"))
         .where(_unconfirmed(place))
         .group_by(artefacts.c.sha256)
         .subquery()
@@ -71,7 +70,7 @@ def read_waiting(connection: Connection, place: str) -> Waiting:
 def next_waiting(connection: Connection, place: str, but: Sequence[str], most: int) -> list[Recorded]:
     """Return files that a place has not confirmed yet, the oldest first, without those named."""
     rows = connection.execute(
-        select(artefacts.c.sha256, artefacts.c.size_bytes)
+        select(artefacts.c.sha256, func.max(artefacts.c.size_bytes).label("size_bytes"))
         .where(_unconfirmed(place))
         .group_by(artefacts.c.sha256)
         .order_by(func.min(artefacts.c.at_utc), artefacts.c.sha256)
@@ -86,19 +85,10 @@ def write_confirmed(store: Store, place: str, confirmed: Sequence[Recorded], at_
     """Record that a place has just stated these files, in a transaction of its own."""
     if not confirmed:
         return
-    row = insert(copies)
-    again = row.on_conflict_do_update(
-        index_elements=["sha256", "place"], set_={"checked_utc": row.excluded.checked_utc}
-    )
-    values = [
-        {
-            "sha256": file.sha256,
-            "place": place,
-            "size_bytes": file.size_bytes,
-            "at_utc": at_utc,
-            "checked_utc": at_utc,
-        }
-        for file in confirmed
-    ]
     with store.database.writing() as connection:
-        connection.execute(again, values)
+        for file in confirmed:
+            here = (copies.c.sha256 == file.sha256) & (copies.c.place == place)
+            if connection.execute(update(copies).where(here).values(checked_utc=at_utc)).rowcount:
+                continue
+            new = {"sha256": file.sha256, "place": place, "size_bytes": file.size_bytes, "at_utc": at_utc}
+            connection.execute(insert(copies).values(**new, checked_utc=at_utc))

@@ -7,6 +7,7 @@ import pwd
 import shutil
 import signal
 import subprocess
+import tempfile
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ _LIVED_WITH_ROOT = "nobody"  # initdb refuses root
 class Cluster:
     """One server. `kill` ends all its processes as a power failure would; `start` starts it again."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._data = folder / "data"
+    def __init__(self) -> None:
+        # A path of a socket is short, and every folder above it is open to the other user.
+        self._folder = Path(tempfile.mkdtemp(prefix="oc-", dir="/tmp"))
+        self._data = self._folder / "data"
         self._count = 0
-        folder.mkdir(parents=True)
-        folder.chmod(0o755)
         if os.geteuid() == 0:
-            shutil.chown(folder, _LIVED_WITH_ROOT)
+            self._folder.chmod(0o755)
+            shutil.chown(self._folder, _LIVED_WITH_ROOT)
         self._run(
             "initdb", "-D", str(self._data), "-U", OTHER, "--auth=trust", "--no-locale", "-E", "UTF8", "--no-sync"
         )
@@ -49,8 +50,9 @@ class Cluster:
         self._run("pg_ctl", "-w", "-D", str(self._data), "-l", str(self._folder / "log"), "-o", options, "start")
 
     def stop(self) -> None:
-        """Stop the server; nobody waits for clients."""
+        """Stop the server without waiting for clients, and remove it."""
         self._run("pg_ctl", "-w", "-m", "immediate", "-D", str(self._data), "stop")
+        shutil.rmtree(self._folder)
 
     def kill(self) -> None:
         """Kill the server's first process and wait until the others have ended with it."""

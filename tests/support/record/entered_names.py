@@ -82,6 +82,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "store gc": ("store", "gc", "--remove", "--min-age-min", "0"),
     "store restore": ("store", "restore", "{site}/backup", "made"),
     "store rebuild": ("store", "rebuild"),
+    "store copy": ("store", "copy", "{data}", "made"),
 }
 # Whoever gives whatever name may do this: pausing is always safe.
 OF_EVERYBODY = {"act pause": ("act", "pause")}
@@ -139,12 +140,15 @@ class NamedSite:
 
     def attempt(self, place: str, name: str, password: str = "") -> Attempt:
         """Act under a name by a command; what it writes goes to a folder of its own."""
-        words = [word.format(site=self.data.parent, job=self.job_id) for word in (COMMANDS | OF_EVERYBODY)[place]]
+        words = [
+            word.format(site=self.data.parent, data=self.data, job=self.job_id)
+            for word in (COMMANDS | OF_EVERYBODY)[place]
+        ]
         with TemporaryDirectory() as folder, chdir(folder):
             made = Path("made")
-            if place == "store restore":
+            if place in ("store restore", "store copy"):
                 status, refusal = _called(words, name, password)
-                since = tuple(path.name for path in made.iterdir())
+                since = tuple(path.name for path in made.iterdir()) if made.is_dir() else ()
             elif place == "store rebuild":  # there is something to rebuild only where the journal was lost
                 shutil.copytree(self.data, made)
                 (made / JOURNAL_NAME).write_bytes(b"")
