@@ -236,6 +236,7 @@ def read_raw_mesh(path: Path) -> RawMesh:
             where=str(path),
             remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
         )
+    _check_shape(path, raw.vertices, raw.faces)
     raw = _without_holes(raw)
     return raw if _valid(raw) else replace(raw, normals=None)
 
@@ -277,6 +278,18 @@ def _valid(raw: RawMesh) -> bool:
 
 def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:
     """Raise UnreadableFileError unless these are finite vertices (V, 3) and faces (F, 3) that refer to them."""
+    _check_shape(path, vertices, faces)
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(bad):
+        raise UnreadableFileError(
+            f"{len(bad)} of {len(vertices)} vertices have coordinates that are not numbers, first vertex {bad[0]}",
+            where=str(path),
+            remedy="Export the scan again; if the problem remains, clean the mesh in the scanner's software",
+        )
+
+
+def _check_shape(path: Path, vertices: Array, faces: IntArray) -> None:
+    """Raise UnreadableFileError unless faces are (F, 3) and refer to vertices (V, 3)."""
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise UnreadableFileError(
             f"vertices have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners, each must have 3",
@@ -288,13 +301,6 @@ def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:
             f"a face refers to vertex {int(faces.max())} of {len(vertices)}",
             where=str(path),
             remedy="The file is damaged or was cut short: export it again",
-        )
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(bad):
-        raise UnreadableFileError(
-            f"{len(bad)} of {len(vertices)} vertices have coordinates that are not numbers, first vertex {bad[0]}",
-            where=str(path),
-            remedy="Export the scan again; if the problem remains, clean the mesh in the scanner's software",
         )
 
 

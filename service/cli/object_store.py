@@ -23,7 +23,7 @@ from service.store.objects.freeing import SpoolFile, free_spool, spool_files
 from service.store.objects.opening import open_objects
 from service.store.objects.s3 import S3Objects
 from service.store.objects.upload import Uploader, alone, write_trouble
-from service.store.site import Site, load_site
+from service.store.site import SiteFile, load_site
 from service.store.store import Store
 
 
@@ -76,7 +76,7 @@ def upload_command(
         raise typer.Exit(ExitStatus.FAILED)
 
 
-def require_objects(data: Path) -> tuple[Site, S3Objects]:
+def require_objects(data: Path) -> tuple[SiteFile, S3Objects]:
     """Return a data folder's site and its object store. Raises ConfigurationError if it names none."""
     site = load_site(data)
     if site is None or site.object_store is None:

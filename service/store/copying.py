@@ -30,7 +30,7 @@ from service.store.database.tables import (
 from service.store.durable_effects import DurableFiles, Files, RandomIds
 from service.store.event_index import EventToIndex, index_events, plain_payload
 from service.store.events import canonical, sha256_text
-from service.store.objects.reading import ArtefactReader
+from service.store.objects.reading import SpoolReader
 from service.store.records import SITE
 from service.store.runs import defer_references
 from service.store.signatures.log import NAME as LOG_NAME
@@ -137,7 +137,7 @@ def _require_no_record(store: Store) -> None:
 
 def _copy_files(reading: Connection, source: Path, store: Store, progress: Progress | None) -> tuple[list[str], int]:
     """Copy all files that the record refers to; return those that the source lacks, and the number copied."""
-    origin = ArtefactReader(source, ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds()))
+    origin = SpoolReader(source, ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds()))
     named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
     sizes = {row.sha256: int(row.size_bytes) for row in reading.execute(named)}
     missing: list[str] = []

@@ -73,7 +73,7 @@ class SpoolSection(_Strict):
     cache_gb: Gigabytes = 20.0
 
 
-class Site(_Strict):
+class SiteFile(_Strict):
     """The content of a `site.yaml`."""
 
     database: str | None = None  # postgresql://ROLE@HOST/DATABASE; None: SQLite in the data folder
@@ -93,7 +93,7 @@ class Site(_Strict):
         return {} if value is None else value
 
 
-def load_site(data_dir: Path) -> Site | None:
+def load_site(data_dir: Path) -> SiteFile | None:
     """Return the site's file of a data folder; None if it has none. Raises ConfigurationError."""
     path = data_dir / SITE_FILE
     try:
@@ -105,7 +105,7 @@ def load_site(data_dir: Path) -> Site | None:
     if len(text) > _MOST_BYTES:
         raise ConfigurationError("this is too long for a site's file", where=str(path), remedy=_REMEDY)
     try:
-        return Site.model_validate(yaml.safe_load(text))
+        return SiteFile.model_validate(yaml.safe_load(text))
     except yaml.YAMLError as error:
         raise ConfigurationError(f"this is not YAML: {error}", where=str(path), remedy=_REMEDY) from error
     except ValidationError as error:

@@ -26,7 +26,7 @@ from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Ages, Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.events import append, read_events, to_event
 from service.store.mounts import require_own_mount
-from service.store.objects.reading import ArtefactReader
+from service.store.objects.reading import SpoolReader
 from service.store.records import (
     SITE,
     Artefact,
@@ -75,7 +75,7 @@ class Store:
     ) -> None:
         self._database = database
         self._folder = folder
-        self._reader = ArtefactReader(path.parent, folder)
+        self._reader = SpoolReader(path.parent, folder)
         self._files = files
         self._clock = clock
         self._ids = ids

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from drivers.errors import DeviceError, IncompleteExportError, UnreadableFileError
 from drivers.meshes.mesh_file import read_mesh_file
@@ -160,3 +162,19 @@ def test_a_file_of_another_kind_than_its_name_says_is_refused_with_the_right_nam
             path.write_bytes(content)
             with pytest.raises(UnreadableFileError, match="Unpack it, or export"):
                 read_surface_file(path, "mm")
+
+
+@pytest.mark.parametrize("wrong", [8, 60_000])
+def test_a_glb_whose_face_refers_to_no_vertex_is_refused(tmp_path: Path, wrong: int) -> None:
+    """Before, it was an IndexError."""
+    content = bytearray(trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="glb"))
+    length = struct.unpack_from("<I", content, 12)[0]
+    document = json.loads(content[20 : 20 + length])
+    (primitive,) = document["meshes"][0]["primitives"]
+    accessor = document["accessors"][primitive["indices"]]
+    start = 28 + length + document["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+    struct.pack_into({5123: "<H", 5125: "<I"}[accessor["componentType"]], content, start, wrong)
+    path = tmp_path / "box.glb"
+    path.write_bytes(content)
+    with pytest.raises(UnreadableFileError, match=f"a face refers to vertex {wrong} of 8"):
+        read_surface_file(path)

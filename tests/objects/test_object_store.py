@@ -15,7 +15,7 @@ from service.core.errors import IntegrityError
 from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreAwayError, ObjectStoreError
 from service.store.objects.probe import probe
-from service.store.objects.signed_requests import Keys
+from service.store.objects.signed_requests import StoreKeys
 from tests.support.processes.object_store import Weed
 
 
@@ -78,7 +78,7 @@ def test_other_content_in_the_store_is_refused_on_fetch_and_not_overwritten(weed
 
 def test_wrong_keys_are_refused_and_a_server_that_is_gone_is_away(tmp_path: Path, weed: Weed) -> None:
     sha256, path = written(tmp_path, b"as captured")
-    stranger = weed.objects("ready", keys=Keys("stranger", "wrong"))
+    stranger = weed.objects("ready", keys=StoreKeys("stranger", "wrong"))
     for attempt in (lambda: stranger.put_if_absent(sha256, path), lambda: stranger.stat(sha256)):
         with pytest.raises(ObjectStoreError) as refused:
             attempt()
@@ -96,7 +96,7 @@ def test_a_probe_finds_a_sound_store_sound_and_one_without_locks_not(weed: Weed)
     assert sound[-1].name == "a locked object cannot be deleted"
     unlocked = probe(weed.new_objects(), SystemClock(), lock_days=1)
     assert [result.name for result in unlocked if result.problem] == ["a locked object cannot be deleted"]
-    refused = probe(weed.objects("ready", keys=Keys("stranger", "wrong")), SystemClock())
+    refused = probe(weed.objects("ready", keys=StoreKeys("stranger", "wrong")), SystemClock())
     assert [bool(result.problem) for result in refused] == [True]
 
 

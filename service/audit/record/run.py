@@ -19,7 +19,7 @@ from service.store.artefacts import ArtefactFiles, read_artefacts
 from service.store.database.opening import open_read_only
 from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
-from service.store.objects.reading import ArtefactReader
+from service.store.objects.reading import SpoolReader
 from service.store.records import Artefact
 from service.store.runs import read_runs, resolve_run
 
@@ -32,7 +32,7 @@ class RecordedFiles:
 
     def __init__(self, data_dir: Path) -> None:
         folder = ArtefactFiles(data_dir / "artefacts", DurableFiles(), RandomIds())
-        self._files = ArtefactReader(data_dir, folder)
+        self._files = SpoolReader(data_dir, folder)
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
         """Return the file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""

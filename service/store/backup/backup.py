@@ -28,7 +28,7 @@ from service.store.database.tables import artefacts, event_index, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
 from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.journal.lines import first_lines
-from service.store.objects.reading import ArtefactReader
+from service.store.objects.reading import SpoolReader
 from service.store.signatures.checkpoints import KeyFolder, read_every_checkpoint
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
@@ -302,7 +302,7 @@ class _Backup:
             return source
         own = ArtefactFiles(self.data_dir / "artefacts", DurableFiles(), RandomIds())
         with suppress(StoreError):  # then it is missing, as the copying will say
-            return ArtefactReader(self.data_dir, own).path(sha256)
+            return SpoolReader(self.data_dir, own).path(sha256)
         return source
 
     def _copy_file(self, sha256: str, source: Path) -> str:

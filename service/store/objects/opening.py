@@ -13,7 +13,7 @@ from service.core.errors import ConfigurationError
 from service.store.data_folder import SITE_FILE
 from service.store.durable_effects import Clock, SystemClock
 from service.store.objects.s3 import S3Objects
-from service.store.objects.signed_requests import Keys
+from service.store.objects.signed_requests import StoreKeys
 from service.store.site import ObjectStoreSection
 
 _VARIABLES = ("ORTHOCAPTURE_S3_ACCESS_KEY_ID", "ORTHOCAPTURE_S3_SECRET_ACCESS_KEY")
@@ -31,7 +31,7 @@ def open_objects(data_dir: Path, section: ObjectStoreSection, clock: Clock | Non
     )
 
 
-def _keys(data_dir: Path, section: ObjectStoreSection) -> Keys:
+def _keys(data_dir: Path, section: ObjectStoreSection) -> StoreKeys:
     if section.keys == "environment":
         values = [os.environ.get(name, "") for name in _VARIABLES]
         missing = [name for name, value in zip(_VARIABLES, values, strict=True) if not value]
@@ -41,7 +41,7 @@ def _keys(data_dir: Path, section: ObjectStoreSection) -> Keys:
                 where=str(data_dir / SITE_FILE),
                 remedy="Set them, or name a file with `keys:`",
             )
-        return Keys(*values)
+        return StoreKeys(*values)
     path = data_dir / section.keys
     remedy = "Write access_key_id and secret_access_key into it as YAML, and `chmod 600` it"
     try:
@@ -60,4 +60,4 @@ def _keys(data_dir: Path, section: ObjectStoreSection) -> Keys:
     values = [found.get(name) for name in names] if isinstance(found, dict) else []
     if len(values) != 2 or not all(isinstance(value, str) and value for value in values):
         raise ConfigurationError("the keys of the object store are incomplete", where=str(path), remedy=remedy)
-    return Keys(*map(str, values))
+    return StoreKeys(*map(str, values))

@@ -22,7 +22,7 @@ _YOUNG_S = 3600.0  # what was used since may still be read
 _PART = ".part"
 
 
-class ArtefactReader:
+class SpoolReader:
     """Gives the files of a data folder to readers. Without a site.yaml it does what the artefact folder does."""
 
     def __init__(self, data_dir: Path, folder: ArtefactFiles) -> None:

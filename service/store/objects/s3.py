@@ -17,7 +17,7 @@ from service.core.errors import ConfigurationError, IntegrityError, StoreError
 from service.store.access import file_mode
 from service.store.durable_effects import Clock
 from service.store.objects.interface import ObjectStoreAwayError, ObjectStoreError, StoredObject
-from service.store.objects.signed_requests import Answer, Keys, SignedRequests
+from service.store.objects.signed_requests import Answer, SignedRequests, StoreKeys
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, S3Store
@@ -49,7 +49,9 @@ def require_obstore() -> None:
 class S3Objects:
     """Objects below a prefix of a bucket, named ab/abcdef… by their SHA-256."""
 
-    def __init__(self, *, endpoint: str, bucket: str, prefix: str, region: str, keys: Keys, clock: Clock) -> None:
+    def __init__(
+        self, *, endpoint: str, bucket: str, prefix: str, region: str, keys: StoreKeys, clock: Clock
+    ) -> None:
         require_obstore()
         from obstore.store import S3Store  # noqa: PLC0415 - an optional package
 

@@ -20,14 +20,14 @@ TIMEOUT_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Keys:
+class StoreKeys:
     """The keys of an object store; they are never printed."""
 
     access_key_id: str
     secret_access_key: str
 
     def __repr__(self) -> str:
-        return "Keys(…)"
+        return "StoreKeys(…)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ def _digest(key: bytes, text: str) -> bytes:
 
 
 def signed_headers(
-    keys: Keys,
+    keys: StoreKeys,
     region: str,
     at: datetime,
     method: str,
@@ -78,7 +78,7 @@ def signed_headers(
 class SignedRequests:
     """Sends signed requests to the objects of one bucket, or to the bucket itself."""
 
-    def __init__(self, endpoint: str, bucket: str, region: str, keys: Keys, clock: Clock) -> None:
+    def __init__(self, endpoint: str, bucket: str, region: str, keys: StoreKeys, clock: Clock) -> None:
         self._endpoint, self._bucket, self._region, self._keys, self._clock = endpoint, bucket, region, keys, clock
 
     def send(

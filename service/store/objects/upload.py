@@ -32,7 +32,7 @@ _LOCK = Path("monitor", "upload.lock")
 
 
 @dataclass(frozen=True, slots=True)
-class Trouble:
+class UploadTrouble:
     """Why nothing is uploaded at present, and since when; it is shown, and is no evidence."""
 
     since_utc: str
@@ -116,7 +116,7 @@ class Uploader:
                     since = utc_text(clock.utc_now())
                     kind = logging.WARNING if isinstance(error, ObjectStoreAwayError) else logging.ERROR
                     _LOG.log(kind, "nothing is uploaded: %s", error.what)
-                write_trouble(self._data, Trouble(since, error.what))
+                write_trouble(self._data, UploadTrouble(since, error.what))
                 wait_s, pause_s = pause_s, min(2 * pause_s, _LONGEST_PAUSE_S)
             if clock.monotonic_s() - refused_s > _AGAIN_S:
                 self.refused.clear()
@@ -142,7 +142,7 @@ def alone(data_dir: Path) -> Generator[bool]:
         os.close(descriptor)
 
 
-def write_trouble(data_dir: Path, trouble: Trouble | None) -> None:
+def write_trouble(data_dir: Path, trouble: UploadTrouble | None) -> None:
     """Say beside the record why nothing is uploaded, or that nothing hinders it."""
     path = data_dir / STATE
     path.parent.mkdir(exist_ok=True)
@@ -154,11 +154,11 @@ def write_trouble(data_dir: Path, trouble: Trouble | None) -> None:
     part.replace(path)
 
 
-def read_trouble(data_dir: Path) -> Trouble | None:
+def read_trouble(data_dir: Path) -> UploadTrouble | None:
     """Return why nothing is uploaded; None if nothing hinders it, or nobody has tried."""
     try:
         found = json.loads((data_dir / STATE).read_text("utf-8"))
-        return Trouble(str(found["since_utc"]), str(found["what"]))
+        return UploadTrouble(str(found["since_utc"]), str(found["what"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -168,7 +168,7 @@ class UploadState:
     """The files that wait for the site's object store, and the trouble that hinders their upload, if any does."""
 
     waiting: Waiting
-    trouble: Trouble | None
+    trouble: UploadTrouble | None
 
     @property
     def sentence(self) -> str:

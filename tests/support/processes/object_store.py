@@ -18,9 +18,9 @@ import yaml
 from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreError
 from service.store.objects.s3 import S3Objects
-from service.store.objects.signed_requests import Keys, SignedRequests
+from service.store.objects.signed_requests import SignedRequests, StoreKeys
 
-KEYS = Keys("test-access", "test-secret")
+KEYS = StoreKeys("test-access", "test-secret")
 REGION = "us-east-1"
 _UP_WITHIN_S = 180.0
 _GRPC = 10_000  # each server listens there, too
@@ -91,7 +91,7 @@ class Weed:
             assert time.monotonic() - began < _UP_WITHIN_S, answered
             time.sleep(0.2)
 
-    def objects(self, bucket: str, prefix: str = "", keys: Keys = KEYS) -> S3Objects:
+    def objects(self, bucket: str, prefix: str = "", keys: StoreKeys = KEYS) -> S3Objects:
         """The adapter to a bucket of this server."""
         return S3Objects(
             endpoint=self.endpoint, bucket=bucket, prefix=prefix, region=REGION, keys=keys, clock=SystemClock()

@@ -123,6 +123,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
 
 def _remembered_contents(*, database_stays: bool) -> Callable[..., list[Fault]]:
     kept: dict[object, list[Fault]] = {}
+    content_faults = search_checks.content_faults
 
     def faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> list[Fault]:
         key: object = tuple(run_ids), every_run
@@ -130,7 +131,7 @@ def _remembered_contents(*, database_stays: bool) -> Callable[..., list[Fault]]:
             read = [tuple(map(tuple, connection.exec_driver_sql(asked))) for asked in _CONTENTS_COME_FROM]
             key = key, tuple(read)
         if key not in kept:
-            kept[key] = list(search_checks.content_faults(connection, run_ids, every_run=every_run))
+            kept[key] = list(content_faults(connection, run_ids, every_run=every_run))
         return kept[key]
 
     return faults
