@@ -141,11 +141,11 @@ def _source() -> str:
 
 
 def _sources(folder: Traversable, name: str) -> Iterator[tuple[str, Traversable]]:
-    for one in folder.iterdir():
-        if one.is_dir():
-            yield from _sources(one, f"{name}/{one.name}")
-        elif one.name.endswith(".py"):
-            yield f"{name}/{one.name}", one
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            yield from _sources(entry, f"{name}/{entry.name}")
+        elif entry.name.endswith(".py"):
+            yield f"{name}/{entry.name}", entry
 
 
 def _paths_in(value: object) -> Iterator[Path]:
