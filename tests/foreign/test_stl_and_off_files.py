@@ -167,7 +167,9 @@ def test_a_file_of_another_kind_than_its_name_says_is_refused_with_the_right_nam
 @pytest.mark.parametrize("wrong", [8, 60_000])
 def test_a_glb_whose_face_refers_to_no_vertex_is_refused(tmp_path: Path, wrong: int) -> None:
     """It was an IndexError before."""
-    content = bytearray(trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="glb"))
+    exported = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="glb")
+    assert isinstance(exported, bytes)
+    content = bytearray(exported)
     length = struct.unpack_from("<I", content, 12)[0]
     document = json.loads(content[20 : 20 + length])
     (primitive,) = document["meshes"][0]["primitives"]
