@@ -15,7 +15,6 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from service.audit.verify.judged_poses import verify_with_limits
 from service.audit.verify.verifications import keep_verification, verification_of
 from service.cli.audit_report import figures_command, report_command
 from service.cli.common import (
@@ -193,14 +192,14 @@ def verify_command(
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as report_progress:
             begun_s = time.monotonic()
-            report = verify_with_limits(
+            report = audit.verify(
                 data,
                 run_id,
                 report_progress,
                 certificates=certificates,
                 signatures_copy=signatures,
                 stated_hashes=stated_hashes,
-            )
+            ).with_limits()
         _tell_the_pages(data, report, time.monotonic() - begun_s)
     if json:
         print_json(report_json(report))
@@ -325,7 +324,9 @@ def _key_json(key: PublicKey) -> dict[str, Any]:
 def report_json(report: AuditReport) -> dict[str, Any]:
     """Return a verification report as plain data, with `ok` and `first_fault` added."""
     first = None if report.first_fault is None else {**asdict(report.first_fault), "text": str(report.first_fault)}
-    return {"ok": report.ok, "first_fault": first, **asdict(report)}
+    fields = asdict(report)
+    del fields["not_judged"]  # among the notes
+    return {"ok": report.ok, "first_fault": first, **fields}
 
 
 def _record_json(record: EvidenceRecord) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from service.audit.verify.judged_poses import verify_with_limits
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -66,7 +65,7 @@ def report_command(
         run_id = resolve_run(audit.list_runs(data), run)
         actor = _actor(data, operator, password_stdin=password_stdin) if _writable(data) else ""
         with progress_bar(quiet=json) as progress:
-            verified = verify_with_limits(data, run_id, progress)
+            verified = audit.verify(data, run_id, progress).with_limits()
             # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
             from service.audit.report.content import report_content  # noqa: PLC0415
@@ -155,7 +154,7 @@ def figures_command(
         require_writable_folder(out)
         run_id = resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as progress:
-            verified = verify_with_limits(data, run_id, progress)
+            verified = audit.verify(data, run_id, progress).with_limits()
             if not verified.ok:
                 error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
                 raise typer.Exit(ExitStatus.FAILED)

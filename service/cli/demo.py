@@ -25,7 +25,6 @@ from service.audit.export.wanted import WantedExport
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output import write_html
-from service.audit.verify.judged_poses import verify_with_limits
 from service.cli.common import (
     JsonOption,
     console,
@@ -52,6 +51,7 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
+from service.store.verification.verify import verify
 
 _EXPORTED = WantedExport("plain")
 _ARM_PORTS = (29999, 30003, 30004)  # of a Universal Robots controller
@@ -114,7 +114,7 @@ def _evaluated(
         export_data_set(store, run_id, _EXPORTED, dataset, "demo", progress)
         database = str(store.database_path)
     files = check_folder(dataset)
-    audit = verify_with_limits(data, run_id, progress)  # with the record of the export
+    audit = verify(data, run_id, progress).with_limits()  # with the record of the export
     truth = true_errors_mm(summary, truth_file)
     write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
     compared = {name: round(value, 4) for name, value in summary.state.steps["ground_truth"].measures.items()}

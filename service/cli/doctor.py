@@ -41,6 +41,7 @@ from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.station import Station
 from service.steps import params_models
+from service.store.data_folder import object_store_of
 from service.store.database.opening import has_database
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import Clock, DurableFiles, SystemClock
@@ -48,7 +49,6 @@ from service.store.mounts import why_unsafe
 from service.store.objects.opening import open_objects
 from service.store.objects.probe import ProbeResult, probe
 from service.store.signatures.second_place import SecondPlace
-from service.store.site import load_site
 from service.store.store import Store
 
 # Optional libraries, which lack wheels for some Pythons and machines, and what is not possible without them.
@@ -131,11 +131,11 @@ def doctor_command(
 
 def _object_store(data: Path) -> list[ProbeResult]:
     """Probe the object store that the site's file names; nothing without one."""
-    site = load_site(data)
-    if site is None or site.object_store is None:
+    section = object_store_of(data)
+    if section is None:
         return []
     clock = SystemClock()
-    return probe(open_objects(data, site.object_store, clock), clock, lock_days=site.object_store.lock_days)
+    return probe(open_objects(data, section, clock), clock, lock_days=section.lock_days)
 
 
 def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | OrthocaptureError]:

@@ -21,6 +21,7 @@ from service.core.run.expected import EarlierTimes
 from service.core.run.state import EARLY
 from service.core.units import gigabytes
 from service.monitor.snapshot import Doing, RobotPhase, living_workers, read_snapshot
+from service.store.database.database import seconds_between
 from service.store.database.tables import event_index, events, jobs, runs
 from service.store.durable_effects import Clock
 from service.store.events import parse_canonical
@@ -130,15 +131,13 @@ def _viewpoint_s(connection: Connection, run_id: str) -> float | None:
 
 
 def _job_seconds(connection: Connection) -> dict[str, tuple[int, float]]:
-    found: dict[str, tuple[int, float]] = {}
-    ended = select(jobs.c.kind, jobs.c.started_utc, jobs.c.ended_utc).where(
-        jobs.c.state == "finished", jobs.c.started_utc.is_not(None)
+    taken_s = seconds_between(connection, jobs.c.started_utc, jobs.c.ended_utc)
+    found = (
+        select(jobs.c.kind, func.count().label("n"), func.sum(taken_s).label("seconds"))
+        .where(jobs.c.state == "finished", jobs.c.started_utc.is_not(None))
+        .group_by(jobs.c.kind)
     )
-    for kind, started, end in connection.execute(ended):
-        taken_s = (datetime.fromisoformat(end) - datetime.fromisoformat(started)).total_seconds()
-        number, total_s = found.get(kind, (0, 0.0))
-        found[kind] = (number + 1, max(0.0, total_s + taken_s))
-    return found
+    return {row.kind: (row.n, max(0.0, float(row.seconds))) for row in connection.execute(found)}
 
 
 def _queue(connection: Connection) -> dict[str, int]:

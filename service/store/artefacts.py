@@ -55,13 +55,13 @@ def chunks_of(path: Path) -> Iterator[bytes]:
 
 def hash_file(path: Path) -> tuple[str, int]:
     """Return the SHA-256 and size in bytes of a file. Raises OSError."""
-    meter = _Meter(chunks_of(path))
+    meter = Meter(chunks_of(path))
     for _ in meter:
         pass
     return meter.sha256, meter.size
 
 
-class _Meter:
+class Meter:
     """Hashes and counts the bytes that pass through."""
 
     def __init__(self, chunks: Iterable[bytes]) -> None:
@@ -77,6 +77,7 @@ class _Meter:
 
     @property
     def sha256(self) -> str:
+        """SHA-256 of what has passed."""
         return self._hash.hexdigest()
 
 
@@ -110,7 +111,7 @@ class ArtefactFiles:
             IntegrityError: the file exists with other content.
         """
         temporary = self._folder / TEMPORARY / f"{self._ids.new_token()}.part"
-        meter = _Meter(chunks)
+        meter = Meter(chunks)
         with _put_errors():
             try:
                 self._files.write(temporary, meter)

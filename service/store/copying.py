@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import RecordCopied
 from service.store.access import KEYS
 from service.store.artefacts import ArtefactFiles, chunks_of
-from service.store.backup.folder import folder_errors
+from service.store.backup.folder import copy_keys, folder_errors
 from service.store.database.opening import open_read_only
 from service.store.database.tables import (
     accounts,
@@ -38,7 +39,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
 _AT_ONCE = 500  # rows
-_TABLES = (heads, artefacts, checkpoints, timestamps, accounts, invitations)
+_TABLES = (heads, artefacts, checkpoints, timestamps, accounts, invitations, jobs)
 Progress = Callable[[str, int, int], None]
 
 
@@ -48,17 +49,6 @@ class CopyReport:
 
     recorded: RecordCopied
     missing: tuple[str, ...]  # files that the source lacks, or has with other content
-
-
-@dataclass(slots=True)
-class _Rows:
-    """The rows that were copied, by table."""
-
-    number: dict[str, int] = field(default_factory=dict[str, int])
-
-    def add(self, table: Table, rows: int) -> None:
-        """Count rows of a table."""
-        self.number[table.name] = self.number.get(table.name, 0) + rows
 
 
 def copy_record(
@@ -101,8 +91,8 @@ def copy_record(
             recorded = RecordCopied(
                 source=str(source.resolve()),
                 database=store.database.where,
-                runs=number.get("runs", 0) - (SITE in ends),
-                events=number.get("events", 0),
+                runs=number[runs.name] - (SITE in ends),
+                events=number[events.name],
                 files=copied,
                 heads_sha256=sha256_text(canonical(ends)),
             )
@@ -160,39 +150,34 @@ def _copy_keys(source: Path, target: Path, files: Files) -> None:
         files.write(target / LOG_NAME, chunks_of(source / LOG_NAME))
         files.sync_file(target / LOG_NAME)
     if (source / KEYS).is_dir():
-        files.make_directory(target / KEYS, private=True)
-        for key in sorted(path for path in (source / KEYS).iterdir() if path.is_file()):
-            files.write(target / KEYS / key.name, [key.read_bytes()], private=True)
-            files.sync_file(target / KEYS / key.name)
-        files.sync_directory(target / KEYS)
+        copy_keys(source / KEYS, target / KEYS, files)
     files.sync_directory(target)
 
 
-def _copy_rows(reading: Connection, writing: Connection) -> dict[str, int]:
+def _copy_rows(reading: Connection, writing: Connection) -> Counter[str]:
     """Copy all rows of the record; returns their number by table. The index of events is derived again."""
     defer_references(writing)
-    counted = _Rows()
+    counted: Counter[str] = Counter()
     _copy_table(reading, writing, runs, counted)
     place = (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
     for chunk in _chunks(reading, select(events).join(event_index, place).order_by(event_index.c.position)):
         writing.execute(insert(events), chunk)
         index_events(writing, [_to_index(row) for row in chunk])
-        counted.add(events, len(chunk))
+        counted[events.name] += len(chunk)
     for table in _TABLES:
         _copy_table(reading, writing, table, counted)
-    _copy_table(reading, writing, jobs, counted)
-    return counted.number
+    return counted
 
 
 def _to_index(row: dict[str, Any]) -> EventToIndex:
     return EventToIndex(row["run_id"], row["seq"], row["kind"], row["actor"], plain_payload(row["payload"]))
 
 
-def _copy_table(reading: Connection, writing: Connection, table: Table, counted: _Rows) -> None:
+def _copy_table(reading: Connection, writing: Connection, table: Table, counted: Counter[str]) -> None:
     order = [table.c.at_utc] if table is checkpoints else []  # the order in which they were made
     for chunk in _chunks(reading, select(table).order_by(*order, *table.primary_key.columns)):
         writing.execute(insert(table), chunk)
-        counted.add(table, len(chunk))
+        counted[table.name] += len(chunk)
 
 
 def _chunks(connection: Connection, statement: Any) -> Iterator[Sequence[dict[str, Any]]]:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.core.errors import ConfigurationError
-from service.store.data_folder import SITE_FILE
+from service.store.data_folder import object_store_of
 
 _LOG = logging.getLogger(__name__)
 _POLL_S = 1.0
@@ -26,7 +26,7 @@ def uploading(data: Path) -> Generator[None]:
 
     A site.yaml that is wrong, or a package that is missing, is logged: the worker goes on without it.
     """
-    if not os.path.isfile(data / SITE_FILE) or not _names_store(data):
+    if not _names_store(data):
         yield
         return
     over = threading.Event()
@@ -40,14 +40,13 @@ def uploading(data: Path) -> Generator[None]:
 
 
 def _names_store(data: Path) -> bool:
-    from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
-    from service.store.site import load_site  # noqa: PLC0415 - for sites only
-
     try:
-        site = load_site(data)
-        if site is None or site.object_store is None:
+        section = object_store_of(data)
+        if section is None:
             return False
-        open_objects(data, site.object_store)
+        from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
+
+        open_objects(data, section)
     except ConfigurationError as error:
         _LOG.error("nothing is uploaded: %s", error)
         return False

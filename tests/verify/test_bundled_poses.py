@@ -14,7 +14,6 @@ from service.audit.bundle.contents import read_bundled_run, write_artefacts, wri
 from service.audit.bundle.crate import crate_json
 from service.audit.bundle.export import FORMAT, MANIFEST_PREFIX
 from service.audit.verify import bundle_verifier
-from service.audit.verify.judged_poses import verify_with_limits
 from service.core.arms.model import arm_model, flange_pose, known_arms
 from service.core.geometry import transform
 from service.core.records.events import DeviceOpened
@@ -24,7 +23,7 @@ from service.store.events import canonical
 from service.store.records import SITE, NewArtefact
 from service.store.signatures.signing import checkpoint, public_keys, sign
 from service.store.store import Store
-from service.store.verification.verify import AuditReport
+from service.store.verification.verify import AuditReport, verify
 from tests.support.pages.states import BEGUN
 from tests.support.record.bundled_site import run_verifier
 from tests.support.record.store import captured, put_image
@@ -50,7 +49,7 @@ def bundled(tmp_path: Path) -> Iterator[Bundled]:
                 ref = put_image(store, name)
                 view = captured(ref, name, T_base_flange=_pose(away_m), joints_rad=JOINTS_RAD)
                 store.record(run_id, [view], actor="runner", artefacts=[NewArtefact(ref, "camera", "capture", 1)])
-            return verify_with_limits(tmp_path / "data", run_id), _export(store, run_id, tmp_path / "bundle.zip")
+            return verify(tmp_path / "data", run_id).with_limits(), _export(store, run_id, tmp_path / "bundle.zip")
 
         yield record
 

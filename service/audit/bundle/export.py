@@ -22,7 +22,6 @@ from service.audit.bundle.contents import (
     writing_bundle,
 )
 from service.audit.bundle.crate import crate_json
-from service.audit.verify.judged_poses import verify_with_limits
 from service.core.errors import IntegrityError
 from service.core.gates.release import refuse_export
 from service.core.protocol.models import Protocol
@@ -36,7 +35,7 @@ from service.store.events import canonical
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint, public_keys, sign
 from service.store.store import Store
-from service.store.verification.verify import AuditReport
+from service.store.verification.verify import AuditReport, verify
 
 FORMAT = "orthocapture bundle v1"
 MANIFEST_PREFIX = b"orthocapture bundle manifest v1\n"
@@ -87,7 +86,7 @@ def require_exportable(
         IntegrityError: the evidence does not verify; it names the first fault.
         IllegalTransitionError: the protocol asks for a release that has not been given.
     """
-    report = verify_with_limits(store.database_path.parent, run_id, progress)
+    report = verify(store.database_path.parent, run_id, progress).with_limits()
     if report.first_fault is not None:
         raise IntegrityError(
             f"nothing is exported, because the evidence does not verify: {report.first_fault}",

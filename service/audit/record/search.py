@@ -105,7 +105,8 @@ def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[st
             conditions.append("1 = 0")
         else:
             positions, values["match"] = matching(connection, terms, beginnings=True)
-            conditions.append(f"i.position IN ({positions})")
+            in_range = f"SELECT position FROM ({positions}) AS found WHERE position BETWEEN :low AND :high"
+            conditions.append(f"i.position IN ({in_range})")
     return " AND ".join(conditions), values
 
 

@@ -15,11 +15,11 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from service.audit.background import ChildProcesses, ChildState, Progress, report
-from service.audit.verify.judged_poses import limits, verify_with_limits
 from service.core.records.events import Record
 from service.store.durable_effects import Clock, utc_text
 from service.store.verification.chain_checks import Fault
-from service.store.verification.verify import AuditReport
+from service.store.verification.pose_checks import NOT_COMPARED
+from service.store.verification.verify import AuditReport, verify
 
 LISTED = 500  # most faults listed in a result
 
@@ -41,7 +41,7 @@ class Outcome(Record):
     @property
     def limits(self) -> list[str]:
         """The notes on what the verification could not judge."""
-        return limits(self.notes)
+        return [note for note in self.notes if NOT_COMPARED in note]
 
 
 class Verification(Outcome):
@@ -128,7 +128,7 @@ def verification(data: Path, run_id: str, progress: Progress) -> Outcome:
     """Verify a run. Raises StoreError."""
     begun_s = time.monotonic()
     progress("reading the events", 0, 0)
-    found = verify_with_limits(data, run_id, progress)
+    found = verify(data, run_id, progress).with_limits()
     return _outcome(found, run_id, found.faults, time.monotonic() - begun_s)
 
 

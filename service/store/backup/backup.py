@@ -21,7 +21,7 @@ from service.core.errors import IntegrityError, StoreError
 from service.core.units import gigabytes
 from service.store.access import KEYS, PEPPER
 from service.store.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
-from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
+from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, copy_keys, folder_errors
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.opening import require_sqlite
 from service.store.database.tables import artefacts, event_index, heads, runs
@@ -317,13 +317,9 @@ class _Backup:
         return ""
 
     def _copy_keys(self, part: Path) -> None:
-        source, keys = self.data_dir / KEYS, part / KEYS
         names = [f"{key_id}.pem" for key_id in KeyFolder(self.data_dir, self.folder.files).present()]
-        self.folder.files.make_directory(keys, private=True)
-        for name in (*names, *(path.name for path in source.glob(PEPPER))):
-            self.folder.files.write(keys / name, [(source / name).read_bytes()], private=True)
-            self.folder.files.sync_file(keys / name)
-        self.folder.files.sync_directory(keys)
+        peppers = [path.name for path in (self.data_dir / KEYS).glob(PEPPER)]
+        copy_keys(self.data_dir / KEYS, part / KEYS, self.folder.files, only=[*names, *peppers])
 
     def _write(self, path: Path, content: bytes) -> None:
         self.folder.files.write(path, [content])

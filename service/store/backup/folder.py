@@ -14,7 +14,7 @@ from __future__ import annotations
 import fcntl
 import json
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -50,6 +50,16 @@ class BackupState(Record):
     root_sha256: str  # root hash of the oldest chain, which identifies the data folder
     with_keys: bool
     faults: tuple[str, ...]  # faults of the data folder itself when it was copied; () if it verified
+
+
+def copy_keys(source: Path, target: Path, files: Files, *, only: Sequence[str] | None = None) -> None:
+    """Copy the files of a folder of keys, or `only` some, durably into a new one that is its owner's alone."""
+    names = sorted(path.name for path in source.iterdir() if path.is_file()) if only is None else only
+    files.make_directory(target, private=True)
+    for name in names:
+        files.write(target / name, [(source / name).read_bytes()], private=True)
+        files.sync_file(target / name)
+    files.sync_directory(target)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.records.events import DataRestored
 from service.store.access import KEYS
 from service.store.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
-from service.store.backup.folder import BackupFolder, BackupState, folder_errors
+from service.store.backup.folder import BackupFolder, BackupState, copy_keys, folder_errors
 from service.store.database.engine import DATABASE_NAME, open_read_only
 from service.store.database.tables import artefacts, control, leases, sessions
 from service.store.durable_effects import DurableFiles, Files, RandomIds
@@ -134,11 +134,7 @@ def _copy_state(state_dir: Path, work: Path, state: BackupState, files: Files) -
                 remedy="Restore an older state with --state; nothing was restored",
             )
     if state.with_keys:
-        files.make_directory(work / KEYS, private=True)
-        for key in sorted(path for path in (state_dir / KEYS).iterdir() if path.is_file()):
-            files.write(work / KEYS / key.name, [key.read_bytes()], private=True)
-            files.sync_file(work / KEYS / key.name)
-        files.sync_directory(work / KEYS)
+        copy_keys(state_dir / KEYS, work / KEYS, files)
 
 
 def _copy_files(source: BackupFolder, work: Path, files: Files, progress: Progress | None) -> list[str]:

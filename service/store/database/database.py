@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 
-from sqlalchemy import Connection, text
+from sqlalchemy import Column, ColumnElement, Connection, DateTime, Double, cast, extract, func, text
 
 from service.store.durable_effects import Clock
 
@@ -22,6 +22,14 @@ def lease_now_s(connection: Connection, clock: Clock) -> float:
     if is_postgres(connection):
         return float(connection.execute(text("SELECT extract(epoch FROM clock_timestamp())")).scalar_one())
     return clock.utc_s()
+
+
+def seconds_between(connection: Connection, begin: Column[str], end: Column[str]) -> ColumnElement[float]:
+    """Return the seconds from one recorded UTC time to another, as an expression of the database."""
+    if is_postgres(connection):
+        taken = cast(end, DateTime(timezone=True)) - cast(begin, DateTime(timezone=True))
+        return cast(extract("epoch", taken), Double)
+    return (func.julianday(end) - func.julianday(begin)) * 86400
 
 
 class Database(ABC):

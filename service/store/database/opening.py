@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.core.errors import StoreError
-from service.store.data_folder import SITE_FILE
+from service.store.data_folder import SITE_FILE, site_of
 from service.store.database import engine
 from service.store.database.database import PATIENCE_S, Database
 from service.store.database.postgres import open_postgres
@@ -17,11 +17,7 @@ def named_database(data_dir: Path) -> str | None:
 
     Raises ConfigurationError.
     """
-    if not (data_dir / SITE_FILE).is_file():
-        return None
-    from service.store.site import load_site  # noqa: PLC0415 - for sites only
-
-    site = load_site(data_dir)
+    site = site_of(data_dir)
     return None if site is None else site.database
 
 

@@ -7,6 +7,7 @@ from sqlalchemy import (
     BigInteger,
     CheckConstraint,
     Column,
+    Double,
     ForeignKey,
     ForeignKeyConstraint,
     Index,
@@ -17,12 +18,11 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
 )
-from sqlalchemy.dialects.postgresql import DOUBLE_PRECISION
 
 metadata = MetaData()
 # PostgreSQL's REAL and INTEGER have four bytes, and its texts are sorted by the language of the server.
 _INTEGER = Integer().with_variant(BigInteger(), "postgresql")
-_REAL = REAL().with_variant(DOUBLE_PRECISION(), "postgresql")
+_REAL = REAL().with_variant(Double(), "postgresql")
 _TEXT = Text().with_variant(Text(collation="C"), "postgresql")
 
 runs = Table(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
 
-from service.store.data_folder import SITE_FILE
+from service.store.artefacts import Meter
+from service.store.data_folder import object_store_of
 from service.store.objects.interface import ObjectStore, ObjectStoreError
 from service.store.verification.chain_checks import FileState
 
@@ -37,26 +37,22 @@ class FilesElsewhere:
                     "" if stated.sha256 else "the file is not here, and the object store states no SHA-256 of it"
                 )
                 return FileState(named, stated.sha256, stated.size_bytes, problem, "stated")
-            digest, size = hashlib.sha256(), 0
-            for chunk in objects.chunks(sha256):
-                digest.update(chunk)
-                size += len(chunk)
+            meter = Meter(objects.chunks(sha256))
+            for _ in meter:
+                pass
         except ObjectStoreError as error:
             return FileState(shown, "", 0, f"{_MISSING} here, and {error.what}", "fetched")
-        return FileState(named, digest.hexdigest(), size, "", "fetched")
+        return FileState(named, meter.sha256, meter.size, "", "fetched")
 
 
 def files_elsewhere(data_dir: Path, *, stated_hashes: bool = False) -> FilesElsewhere | None:
     """Return the files of a site's object store; None for a data folder without one. Raises ConfigurationError."""
-    if not (data_dir / SITE_FILE).is_file():
+    section = object_store_of(data_dir)
+    if section is None:
         return None
     from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
-    from service.store.site import load_site  # noqa: PLC0415 - for sites only
 
-    site = load_site(data_dir)
-    if site is None or site.object_store is None:
-        return None
-    return FilesElsewhere(partial(open_objects, data_dir, site.object_store), stated_hashes=stated_hashes)
+    return FilesElsewhere(partial(open_objects, data_dir, section), stated_hashes=stated_hashes)
 
 
 def not_elsewhere(data_dir: Path, names: Iterable[str]) -> list[str]:

@@ -11,7 +11,7 @@ from service.core.errors import ConfigurationError, IntegrityError, StoreError
 from service.core.units import bytes_of_gigabytes
 from service.store.access import folder_mode, make_folder
 from service.store.artefacts import ArtefactFiles, hash_file, relative_path
-from service.store.data_folder import SITE_FILE
+from service.store.data_folder import site_of
 from service.store.objects.interface import ObjectStoreError
 
 if TYPE_CHECKING:
@@ -45,12 +45,11 @@ class SpoolReader:
             return self._fetched(sha256, missing, verify=verify)
 
     def _has_store(self) -> bool:
-        if self._objects is None and (self._data / SITE_FILE).is_file():
-            from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
-            from service.store.site import load_site  # noqa: PLC0415 - for sites only
-
-            site = load_site(self._data)
+        if self._objects is None:
+            site = site_of(self._data)
             if site is not None and site.object_store is not None:
+                from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
+
                 self._objects = open_objects(self._data, site.object_store)
                 self._most_bytes = bytes_of_gigabytes(site.spool.cache_gb)
         return self._objects is not None

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from service.core.errors import ConfigurationError, IntegrityError, StoreError
 from service.store.access import file_mode
+from service.store.artefacts import Meter
 from service.store.durable_effects import Clock
 from service.store.objects.interface import ObjectStoreAwayError, ObjectStoreError, StoredObject
 from service.store.objects.signed_requests import Answer, SignedRequests, StoreKeys
@@ -149,15 +150,12 @@ class S3Objects:
 
         Raises IntegrityError, and leaves no file, if its content is not that of its name.
         """
-        digest, size = hashlib.sha256(), 0
+        meter = Meter(self.chunks(sha256))
         try:
             with to.open("xb") as file:
                 to.chmod(file_mode(to.parent))
-                for chunk in self.chunks(sha256):
-                    digest.update(chunk)
-                    size += len(chunk)
-                    file.write(chunk)
-            self._require_content(sha256, digest.hexdigest())
+                file.writelines(meter)
+            self._require_content(sha256, meter.sha256)
         except OSError as error:
             to.unlink(missing_ok=True)
             raise StoreError(
@@ -168,7 +166,7 @@ class S3Objects:
         except BaseException:
             to.unlink(missing_ok=True)
             raise
-        return size
+        return meter.size
 
     def _require_content(self, sha256: str, found: str) -> None:
         if found != sha256:

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
 from service.store.artefacts import relative_path
+from service.store.data_folder import object_store_of
 from service.store.durable_effects import utc_text
 from service.store.objects.copies import Recorded, Waiting, next_waiting, read_waiting, write_confirmed
 from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
-from service.store.site import load_site
 from service.store.store import Store
 
 _LOG = logging.getLogger(__name__)
@@ -182,9 +182,9 @@ class UploadState:
 def upload_state(store: Store) -> UploadState | None:
     """Return the state of the uploads of a data folder; None without an object store. Raises ConfigurationError."""
     data_dir = store.database_path.parent
-    site = load_site(data_dir)
-    if site is None or site.object_store is None:
+    section = object_store_of(data_dir)
+    if section is None:
         return None
     with store.database.reading() as connection:
-        waiting = read_waiting(connection, site.object_store.place)
+        waiting = read_waiting(connection, section.place)
     return UploadState(waiting, read_trouble(data_dir))

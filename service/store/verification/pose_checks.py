@@ -5,15 +5,19 @@ Only arms whose controllers report the pose of the tool are judged. Others repor
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from service.core.recorded_devices import recorded_report
+from service.core.text.words import counted
 from service.core.units import deg, mm
 
 if TYPE_CHECKING:
     from service.core.arms.model import ArmModel
+
+NOT_COMPARED = " are not compared, because "  # in every sentence on views that are not judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,36 +47,67 @@ class AwayView:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _OpenedArm:
+    """An arm as it was opened: its model's name, and its kinematics or why its views cannot be judged."""
+
+    model: str
+    kinematics: ArmModel | None
+    why_not: str = ""
+
+    @classmethod
+    def of(cls, model: str) -> _OpenedArm:
+        from service.core.arms.model import known_arm  # noqa: PLC0415 - searches for plug-ins
+
+        arm = known_arm(model)
+        if arm is None:
+            return cls(model, None, f"no kinematics are known for an arm {model!r}")
+        if arm.family != "universal_robot":
+            return cls(model, None, f"the controller of an arm {model} reports the flange, whatever its tool")
+        return cls(model, arm)
+
+
 @dataclass
 class PoseFacts:
-    """The arms of a run, and those of its views whose pose does not fit their joints."""
+    """The arms of a run, those of its views whose pose does not fit their joints, and those that cannot be judged."""
 
-    _arms: dict[str, ArmModel | None] = field(default_factory=dict[str, "ArmModel | None"])  # None: cannot be judged
+    _arms: dict[str, _OpenedArm] = field(default_factory=dict[str, _OpenedArm])
+    _unjudged: Counter[str] = field(default_factory=Counter[str])  # reason → number of views
     _away: dict[int, AwayView] = field(default_factory=dict[int, AwayView])
     _last: dict[tuple[str, ...], int] = field(default_factory=dict[tuple[str, ...], int])  # view → its newest event
 
     def open(self, device: str, report: object) -> None:
         """Add a device_opened event: the device's name in rig.yaml, and its DeviceReport as plain data."""
-        from service.core.arms.model import known_arm  # noqa: PLC0415 - searches for plug-ins
-
         identity = recorded_report(report).identity
         if identity.kind == "robot":
-            arm = known_arm(identity.model)
-            self._arms[device] = arm if arm is not None and arm.family == "universal_robot" else None
+            self._arms[device] = _OpenedArm.of(identity.model)
 
     def look(self, seq: int, view: ReportedPose) -> None:
         """Add a viewpoint_captured event."""
         self._last[view.step, view.viewpoint, view.station] = seq
-        if not self._arms or None in self._arms.values():
+        why_not = next((arm.why_not for arm in self._arms.values() if arm.why_not), "")
+        if why_not or not self._arms:
+            self._unjudged[why_not or "the record names no arm that was connected before"] += 1
             return
         import numpy as np  # noqa: PLC0415 - which few verifications need
 
         from service.core.arms.model import fits, flange_pose, pose_gap  # noqa: PLC0415
 
         joints, pose = np.array(view.joints_rad, dtype=float), np.array(view.T_base_flange, dtype=float)
-        gaps = [pose_gap(flange_pose(a, joints), pose) for a in self._arms.values() if a and a.axes == len(joints)]
-        if gaps and not any(map(fits, gaps)):
+        arms = [arm.kinematics for arm in self._arms.values()]
+        gaps = [pose_gap(flange_pose(a, joints), pose) for a in arms if a and a.axes == len(joints)]
+        if not gaps:
+            models = " and ".join(dict.fromkeys(arm.model for arm in self._arms.values()))
+            self._unjudged[f"an arm {models} has not the {len(joints)} joints that were recorded"] += 1
+        elif not any(map(fits, gaps)):
             self._away[seq] = AwayView(seq, view.viewpoint, *min(gaps))
+
+    def not_judged(self) -> list[str]:
+        """Return a sentence for each reason for which views are not judged, with their number."""
+        return [
+            f"pose and joints of {counted(number, 'view')}{NOT_COMPARED}{reason}"
+            for reason, number in self._unjudged.items()
+        ]
 
     def findings(self, run_id: str) -> tuple[list[AwayView], list[str]]:
         """Return views whose newest image has a wrong pose, and notes on those that were taken again since."""

@@ -55,6 +55,11 @@ class AuditReport:
     key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first, to compare as well
     faults: tuple[Fault, ...]  # faults in the order of the chain
     notes: tuple[str, ...]
+    not_judged: tuple[str, ...] = ()  # sentences on views whose pose cannot be compared with their joints, by run
+
+    def with_limits(self) -> AuditReport:
+        """Return the report with what could not be judged among its notes, unless it has faults."""
+        return replace(self, notes=(*self.notes, *self.not_judged)) if self.ok else self
 
     @property
     def ok(self) -> bool:
@@ -194,7 +199,13 @@ def _verify(
         *people_faults(site.people, evidence.accounts, evidence.links, evidence.sessions),
     ]
     counted = _counted(data_dir, evidence, chains, files or {})
-    return replace(counted, key_ids=tuple(keys.periods), faults=tuple(faults), notes=(*notes, *said_of_log, *orphans))
+    return replace(
+        counted,
+        key_ids=tuple(keys.periods),
+        faults=tuple(faults),
+        notes=(*notes, *said_of_log, *orphans),
+        not_judged=tuple(f"{run}: {said}" for run in evidence.run_ids for said in chains[run].poses.not_judged()),
+    )
 
 
 def _log_findings(
