@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import queue
 import signal
 import socket
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType
 
 _PARENT_POLL_S = _SLICE_S = 0.5
@@ -46,24 +48,30 @@ def add_patience(parser: argparse.ArgumentParser) -> None:
 
 
 class Termination:
-    """Set by SIGTERM or SIGINT. Create it in the main thread."""
+    """Set by SIGTERM or SIGINT. Create it in the main thread.
+
+    It is no Event: a handler that sets one waits for ever for its lock if the signal interrupts the main thread while
+    that holds the lock within `wait`. A SimpleQueue may be put into from a handler.
+    """
 
     def __init__(self) -> None:
-        self._event = threading.Event()
+        self._over = False
+        self._news: queue.SimpleQueue[None] = queue.SimpleQueue()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del number, frame
-        self._event.set()
+        self.set()
 
     def set(self) -> None:
         """End the process as SIGTERM would."""
-        self._event.set()
+        self._over = True
+        self._news.put(None)
 
     def is_set(self) -> bool:
         """Return whether the process should end."""
-        return self._event.is_set()
+        return self._over
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Block until the process should end (returns True) or the timeout expires (returns False)."""
@@ -73,7 +81,8 @@ class Termination:
             if remaining_s <= 0:
                 return False
             slice_s = min(_SLICE_S, remaining_s)
-            self._event.wait(slice_s)
+            with suppress(queue.Empty):
+                self._news.get(timeout=slice_s)
             remaining_s -= slice_s
         return True
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import signal
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +11,7 @@ import typer
 
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder
+from service.cli.stop_request import stop_requested
 from service.core.errors import ConfigurationError
 from service.core.units import bytes_of_gigabytes
 
@@ -48,9 +48,6 @@ def dicom_listen_command(
             )
         require_writable_folder(folder)
         folder.mkdir(exist_ok=True)
-        stopped = threading.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda _number, _frame: stopped.set())
         config = ReceiverConfig(folder, ae_title, host, port, tuple(callers or ()), bytes_of_gigabytes(reserve_gb))
         told = threading.Lock()
 
@@ -61,7 +58,7 @@ def dicom_listen_command(
                 else:
                     console.print(text)
 
-        with Receiver(config, tell) as receiver:
+        with stop_requested() as stopped, Receiver(config, tell) as receiver:
             if json:
                 print_json({"ae_title": ae_title, "host": host, "port": receiver.port, "folder": str(folder)})
             else:

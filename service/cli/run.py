@@ -49,6 +49,7 @@ from service.cli.options import (
     described,
 )
 from service.cli.status import status_record
+from service.cli.stop_request import stop_requested
 from service.core.errors import ConfigurationError, PersonNeededError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.entered import about_run
@@ -186,8 +187,8 @@ def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Dis
     seen: set[str] = set()
     total = len(pending)
     try:
-        with _told_to_leave() as leave:
-            while store.open_jobs(run_id) and not leave.is_set():
+        with stop_requested() as leave:  # an exception could get lost in a finaliser or callback
+            while store.open_jobs(run_id) and not leave.is_made():
                 left = results_to_come(run.now())
                 for one in left:
                     if one.failed and one.name not in seen:
@@ -202,21 +203,9 @@ def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Dis
                 leave.wait(_LOOK_S)
     finally:
         display.clear()
-    if leave.is_set():
+    if leave.is_made():
         data = store.database_path.parent
         display.tell(f"Left for later: `orthocapture worker --data {data} --until-idle` computes what is missing")
-
-
-@contextmanager
-def _told_to_leave() -> Generator[threading.Event]:
-    """Yield an event set by Ctrl-C and SIGTERM; an exception could get lost in a finaliser or callback."""
-    leave = threading.Event()
-    before = {number: signal.signal(number, lambda *_: leave.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield leave
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
