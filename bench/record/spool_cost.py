@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
+from service.store.data_folder import object_store_of
 from service.store.objects.copies import read_waiting
 from service.store.records import NewArtefact
-from service.store.site import Site, load_site
 from service.store.store import Store
 from tests.support.processes.object_store import Weed
 from tests.support.record.store import captured, start_run
@@ -115,12 +115,11 @@ def _capture(store: Store, run_id: str, viewpoint: str, photograph: bytes) -> No
 
 def _drained(data: Path, store: Store) -> None:
     """Wait until the uploader has nothing left, so that the next folder's captures do not meet its uploads."""
-    site = load_site(data)
-    assert isinstance(site, Site)
-    assert site.object_store is not None
+    section = object_store_of(data)
+    assert section is not None
     while True:
         with store.database.reading() as connection:
-            if not read_waiting(connection, site.object_store.place).files:
+            if not read_waiting(connection, section.place).files:
                 return
         time.sleep(0.2)
 
