@@ -156,7 +156,7 @@ def test_command_lines(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STAND_INS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.sweep) for name in STAND_INS])
 @pytest.mark.usefixtures("stand_ins")
 def test_a_method_is_run_and_its_mesh_comes_back_into_the_world(name: str, dataset: DataSet, tmp_path: Path) -> None:
     method = methods()[name]

@@ -132,6 +132,7 @@ def test_the_method_needs_nothing_else() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep  # a small run of it: test_benchmark_command.py
 def test_the_benchmark_scores_the_stereo_method_on_images_alone(dataset: DataSet, tmp_path: Path) -> None:
     trial = Trial(methods()["stereo"], "dense", tmp_path, settings=ChamferSettings(spacing_m=2e-3))
     result = run_trial(trial, dataset)

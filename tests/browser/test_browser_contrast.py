@@ -110,7 +110,15 @@ OTHER_PAGES: tuple[tuple[Role, str], ...] = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shown", RUN_PAGES, ids=lambda shown: f"{shown[0].__name__}{shown[1][11:]}")
+@pytest.mark.parametrize(
+    "shown",
+    [
+        pytest.param(
+            (state, path), id=f"{state.__name__}{path[11:]}", marks=pytest.mark.sweep(always=state is about_to_move)
+        )
+        for state, path in RUN_PAGES
+    ],
+)
 def test_every_control_of_a_run_can_be_read_in_every_state(
     page: Page, tmp_path: Path, shown: tuple[Callable[[WebSite], Seen], str]
 ) -> None:

@@ -44,6 +44,7 @@ def same(one: Sequence[Any], other: Sequence[Any]) -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_pictures_and_previews_are_the_same_to_the_last_bit_whether_kept_or_computed(folder: Path) -> None:
     scene = Scene.generate(5)
     world = World(scene, WIDTH, (), np.zeros(6), camera_held=True, control_spheres=True)

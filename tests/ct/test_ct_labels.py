@@ -40,6 +40,7 @@ def read(folder: Path, *segments: str) -> CtLabels:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 @pytest.mark.parametrize("kind", ["BINARY", "FRACTIONAL", "LABELMAP"])
 @pytest.mark.parametrize("rotation", [np.eye(3), OBLIQUE])
 def test_a_segmentation_lies_on_the_voxels_it_was_made_of(tmp_path: Path, kind: str, rotation: Array) -> None:

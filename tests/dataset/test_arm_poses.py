@@ -47,7 +47,7 @@ def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, Ru
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ARM)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.sweep) for name in ARM])
 def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, name: str, tmp_path: Path) -> None:
     answer, summary = stated(run, arm_jobs(run)[name], tmp_path)
     record = answer.answer

@@ -343,7 +343,9 @@ def test_a_pulled_cable_is_unavailable_and_opens_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["drop", "corrupt", "truncate", "stall"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.sweep) for kind in ("drop", "corrupt", "truncate", "stall")]
+)
 def test_spoilt_reports_do_not_stop_a_motion(tmp_path: Path, kind: str) -> None:
     with table(tmp_path, *fault(on="?", kind=kind, nth=30, times=2, value=0.1)) as port, opened(port) as arm:
         let_move(arm)

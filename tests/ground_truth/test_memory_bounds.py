@@ -13,7 +13,14 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("what", "limit_mb"), [("compared", 120), ("fused", 80), ("covered", 58), ("nearest", 39), ("extracted", 600)]
+    ("what", "limit_mb"),
+    [
+        pytest.param("compared", 120, marks=pytest.mark.sweep(always=True)),
+        pytest.param("fused", 80, marks=pytest.mark.sweep),
+        pytest.param("covered", 58, marks=pytest.mark.sweep),
+        pytest.param("nearest", 39, marks=pytest.mark.sweep),
+        pytest.param("extracted", 600, marks=pytest.mark.sweep),
+    ],
 )
 def test_surfaces_are_computed_within_a_hard_limit_of_memory(what: str, limit_mb: int) -> None:
     command = [sys.executable, "-m", "tests.support.processes.bounded_memory", what, str(limit_mb)]

@@ -91,11 +91,11 @@ def connected(host: str) -> Generator[Client]:
 @pytest.mark.parametrize(
     ("stubs", "folders"),
     [
-        ("stubs1", ["sunrise1"]),
-        ("stubs1", ["sunrise1", "sunrise1_fri"]),
-        ("stubs2", ["sunrise2"]),
-        ("stubs2", ["sunrise2", "sunrise25_fri"]),
-        ("stubs2", ["sunrise2", "sunrise27_fri"]),
+        pytest.param("stubs1", ["sunrise1"], marks=pytest.mark.sweep),
+        pytest.param("stubs1", ["sunrise1", "sunrise1_fri"], marks=pytest.mark.sweep),
+        pytest.param("stubs2", ["sunrise2"], marks=pytest.mark.sweep),
+        pytest.param("stubs2", ["sunrise2", "sunrise25_fri"], marks=pytest.mark.sweep),
+        pytest.param("stubs2", ["sunrise2", "sunrise27_fri"], marks=pytest.mark.sweep(always=True)),
     ],
 )
 def test_the_application_compiles_for_each_version(tmp_path: Path, stubs: str, folders: list[str]) -> None:

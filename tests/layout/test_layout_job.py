@@ -16,7 +16,7 @@ from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("k1", "width"), [(-0.07, 1920), pytest.param(-0.1, 1440, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("k1", "width"), [(-0.07, 1920), pytest.param(-0.1, 1440, marks=pytest.mark.sweep)])
 def test_a_large_photograph_by_a_lens_that_was_not_calibrated_shows_all_spheres(
     tmp_path: Path, k1: float, width: int
 ) -> None:

@@ -209,6 +209,7 @@ def test_a_vote_keeps_what_both_find_and_what_one_finds_clearly() -> None:
 
 @needs_torch
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_all_detectors_are_measured_side_by_side(tiny: Weights, tmp_path: Path) -> None:
     size = ("--images", "1", "--width", "400", "--only", "behind tissue", "--out", str(tmp_path))
     command = [sys.executable, "-m", "bench.markers.detectors", *size]

@@ -77,7 +77,10 @@ def true_spheres(made: Scene, image: int, located: LocatedOutlines) -> list[tupl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("poses", ["true", "robot", "no scale"])
+@pytest.mark.parametrize(
+    "poses",
+    [pytest.param("true", marks=pytest.mark.sweep), "robot", pytest.param("no scale", marks=pytest.mark.sweep)],
+)
 def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -> None:
     made, paths, whole = captured
     given_poses = np.array(made.T_world_camera)

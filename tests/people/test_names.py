@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,7 @@ from tests.support.record.entered_names import (
 from tests.support.record.office import Office
 from tests.support.record.stepped_clock import SteppedClock
 
-# One of each kind, for the tests that are quick; the sweep takes all.
+# One of each kind, for the tests that are quick: in turn, one at each place. The sweep takes all at every place.
 FEW = ("emmy\u200b", "\u0435mmy", "\x1b[2Jemmy", "runner", "A Stranger", "emmy\n")
 FEW_OF_NOBODY = ("emmy\u200b", "\u0435mmy", "\x1b[2Jemmy", "runner", "claimed:emmy")
 
@@ -116,6 +117,11 @@ def without(tmp_path_factory: pytest.TempPathFactory) -> NamedSite:
     return site_without_accounts(tmp_path_factory.mktemp("without"))
 
 
+def in_turn(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Each place with one of the names, so that all of them have their turn."""
+    return list(zip(COMMANDS, itertools.cycle(names), strict=False))
+
+
 def refused_at(site: NamedSite, place: str, names: Iterable[str]) -> None:
     """Nobody acts under these names at a place where a name enters."""
     for name in names:
@@ -124,15 +130,17 @@ def refused_at(site: NamedSite, place: str, names: Iterable[str]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", COMMANDS)
-def test_where_there_are_accounts_nobody_else_acts(site: NamedSite, place: str) -> None:
-    refused_at(site, place, FEW[:4])
+@pytest.mark.parametrize(("place", "name"), in_turn(FEW[:4]))
+def test_where_there_are_accounts_nobody_else_acts(site: NamedSite, place: str, name: str) -> None:
+    refused_at(site, place, (name,))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", COMMANDS)
-def test_where_there_are_none_nobody_acts_under_a_name_that_is_no_persons(without: NamedSite, place: str) -> None:
-    refused_at(without, place, FEW_OF_NOBODY)
+@pytest.mark.parametrize(("place", "name"), in_turn(FEW_OF_NOBODY))
+def test_where_there_are_none_nobody_acts_under_a_name_that_is_no_persons(
+    without: NamedSite, place: str, name: str
+) -> None:
+    refused_at(without, place, (name,))
 
 
 @pytest.mark.slow

@@ -128,7 +128,9 @@ def test_images_all_of_another_size_blame_the_camera_model(photographs: BoardFol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", ["bmp", "pgm", "pnm", "png", "tif"])
+@pytest.mark.parametrize(
+    "suffix", [pytest.param(suffix, marks=pytest.mark.sweep) for suffix in ("bmp", "pgm", "pnm", "png", "tif")]
+)
 def test_other_formats_of_images_are_read(photographs: BoardFolder, tmp_path: Path, suffix: str) -> None:
     images = tmp_path / "images"
     images.mkdir()

@@ -1,13 +1,15 @@
 """Draws a tenth of the tests that are too many to run each time: whole runs, and rows of systematic sweeps.
 
 `pytest --draw SEED` keeps every test but those marked `whole` or `sweep`, of which it keeps a tenth, chosen by the
-seed (continuous integration gives the commit's hash), and prints which. Tests marked `whole(always=True)` are kept
-whatever the seed. Without `--draw` all of them run.
+seed (continuous integration gives the commit's hash), and prints which. Of every matrix, however small, at least one
+row is drawn. Tests and rows marked `whole(always=True)` or `sweep(always=True)` are kept whatever the seed. Without
+`--draw` all of them run.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Iterable
 
 import pytest
@@ -25,6 +27,22 @@ def drawn(seed: str, units: Iterable[str]) -> set[str]:
     return set(ranked[: -(-len(ranked) // ONE_IN)])
 
 
+def drawn_rows(seed: str, rows: Iterable[str]) -> set[str]:
+    """Return a tenth of each parametrised test's rows, at least one; tests of a single row are drawn together.
+
+    >>> large, small = [f"t.py::large[{i}]" for i in range(30)], ["t.py::small[a]", "t.py::small[b]"]
+    >>> single = [f"t.py::single_{i}" for i in range(12)]
+    >>> kept = drawn_rows("a", [*large, *small, *single])
+    >>> [len(kept & set(rows)) for rows in (large, small, single)]
+    [3, 1, 2]
+    """
+    matrices: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        test, bracket, _ = row.partition("[")
+        matrices[test if bracket else ""].append(row)
+    return {row for matrix in matrices.values() for row in drawn(seed, matrix)}
+
+
 class Draw:
     """The plug-in: deselects what was not drawn, and says what was."""
 
@@ -34,16 +52,16 @@ class Draw:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
-        """Deselect what was not drawn: whole runs by file, since a file's tests share one; sweeps by row."""
+        """Deselect what was not drawn: whole runs by file, since a file's tests share one; sweeps row by row."""
         left_out: set[pytest.Item] = set()
-        for mark in ("whole", "sweep"):
+        for mark, draw in (("whole", drawn), ("sweep", drawn_rows)):
             units: dict[str, list[pytest.Item]] = {}
             for item in items:
                 found = item.get_closest_marker(mark)
                 if found is not None and not found.kwargs.get("always", False):
                     unit = item.nodeid.partition("::")[0] if mark == "whole" else item.nodeid
                     units.setdefault(unit, []).append(item)
-            kept = drawn(self._seed, units)
+            kept = draw(self._seed, units)
             self._kept[mark] = (len(units), sorted(kept))
             left_out.update(item for unit, members in units.items() if unit not in kept for item in members)
         config.hook.pytest_deselected(items=[item for item in items if item in left_out])

@@ -98,6 +98,7 @@ def test_a_camera_is_listed_and_no_picture_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep  # each device alone: test_round_trips.py, test_replayed_machines.py, test_replayed_canon.py
 def test_a_whole_rig_is_the_same_on_its_replay(tmp_path: Path) -> None:
     said: list[dict[str, RecordedDevice]] = []
     for name, replay in (("first", ()), ("again", ("--replay", str(tmp_path / "first.json")))):

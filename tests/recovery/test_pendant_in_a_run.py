@@ -63,7 +63,7 @@ def in_force(run: OneArmRun) -> list[ViewpointCaptured]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", [pytest.param("in motion", marks=pytest.mark.slow), "exposing"])
+@pytest.mark.parametrize("moment", [pytest.param("in motion", marks=pytest.mark.sweep), "exposing"])
 def test_an_arm_that_was_pushed_is_asked_about(tmp_path: Path, store: Store, moment: str) -> None:
     with arm_at(88, *SPEED_UP) as (host, arm):
         run = OneArmRun(store, tmp_path, host, arm)
@@ -81,12 +81,12 @@ def test_an_arm_that_was_pushed_is_asked_about(tmp_path: Path, store: Store, mom
     ("act", "moment", "words"),
     [
         pytest.param(
-            *(TCP, "in motion", "the tool centre point was changed by 100.0 mm and 0.0°"), marks=pytest.mark.slow
+            *(TCP, "in motion", "the tool centre point was changed by 100.0 mm and 0.0°"), marks=pytest.mark.sweep
         ),
         (TCP, "exposing", "the tool centre point was changed by 100.0 mm and 0.0°"),
         pytest.param(
             *("payload 3 0 0 0.08", "exposing", "the payload was changed from 1.6 kg to 3 kg"),
-            marks=pytest.mark.slow,
+            marks=pytest.mark.sweep,
         ),
     ],
 )

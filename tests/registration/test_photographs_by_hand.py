@@ -29,6 +29,7 @@ def run(*words: object) -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.slow  # renders photographs, matches them and searches them for spheres
+@pytest.mark.sweep  # each command alone: test_sfm_command.py, test_register_command.py
 def test_a_model_from_the_photographs_alone_is_registered_with_the_scan_that_gives_its_scale(tmp_path: Path) -> None:
     scene = Scene.generate(SEED)
     poses = {

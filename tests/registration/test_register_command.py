@@ -375,6 +375,7 @@ def test_the_papers_detector_takes_the_boxes_of_another(capture: Capture, few: P
 
 @pytest.mark.packages("torch")
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_grounded_and_vote_record_the_hashes_of_their_weights(
     capture: Capture, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

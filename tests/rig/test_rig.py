@@ -320,7 +320,7 @@ def two_station_protocol(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arm", ["UR10e", "LBR Med 14"])
+@pytest.mark.parametrize("arm", ["UR10e", pytest.param("LBR Med 14", marks=pytest.mark.sweep)])
 def test_two_controllers_are_found_and_used(tmp_path: Path, arm: str) -> None:
     """An arm at each station, both running at once."""
     data = tmp_path / "data"

@@ -93,7 +93,9 @@ def _pages(shown: ShownSite) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize(
+    "role", [pytest.param(role, marks=pytest.mark.sweep(always=role == "technician")) for role in ROLES]
+)
 def test_a_role_may_what_it_is_offered_and_no_button_leads_where_it_has_nothing(
     web: WebSite, shown: ShownSite, role: Role
 ) -> None:

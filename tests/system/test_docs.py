@@ -367,8 +367,15 @@ RUN_ELSEWHERE = {
 }
 
 
+# What a user types first, an auditor last; of the others a tenth are drawn.
+ALWAYS = ("orthocapture status latest --data runs", "orthocapture audit verify latest --data runs")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("command", RUN_HERE)
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(command, marks=pytest.mark.sweep(always=command in ALWAYS)) for command in RUN_HERE],
+)
 def test_the_command_works_as_it_is_written(site: Site, command: str) -> None:
     RUN_HERE[command](site, command)
 

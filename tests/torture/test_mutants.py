@@ -142,7 +142,10 @@ def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("after", "outcome"), [("value < LIMIT", "killed"), ("value <= 2 * LIMIT", "survived")])
+@pytest.mark.parametrize(
+    ("after", "outcome"),
+    [("value < LIMIT", "killed"), pytest.param("value <= 2 * LIMIT", "survived", marks=pytest.mark.sweep)],
+)
 def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
     tmp_path: Path, after: str, outcome: str
 ) -> None:
