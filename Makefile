@@ -20,11 +20,11 @@ demo: $(READY)
 test: $(TOOLS)
 	$(BIN)/pytest -m "not (slow or realtime or packages or whole or sweep)" --ignore=tests/browser
 
-# All tests: those that meet the clock run alone, after the others.
+# All tests: those that meet the clock run after the others, two at a time, for they wait most of theirs.
 test-all: $(TOOLS) $(NETWORKS)
 	.ci/packages
 	$(BIN)/pytest -m "not realtime"
-	$(BIN)/pytest -m realtime -n 0 $(call with,realtime)
+	$(BIN)/pytest -m realtime -n 2 $(call with,realtime)
 
 # What `make test` leaves out, but for the tests that meet the clock, with a tenth of the whole runs and sweeps: SEED
 # draws them.
@@ -33,9 +33,10 @@ test-drawn: $(TOOLS) $(NETWORKS)
 	.ci/packages
 	$(BIN)/pytest -m "(slow or packages or whole or sweep) and not realtime" --draw $(SEED) $(call with,slow|packages|whole|sweep) tests/browser
 
-# The tests that meet the clock, alone.
+# The tests that meet the clock, with nothing else: two at a time, for they wait most of theirs. Beside much more than that
+# none fails by chance (bench/suite/realtime.py).
 test-realtime: $(TOOLS)
-	$(BIN)/pytest -m realtime -n 0 $(call with,realtime)
+	$(BIN)/pytest -m realtime -n 2 $(call with,realtime)
 
 # The test files in which one of these marks stands: to read all of the others takes pytest half a minute.
 with = $$(grep -rlwE '$(1)' tests --include='test_*.py')

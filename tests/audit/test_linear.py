@@ -60,7 +60,7 @@ def held_already(record: LargeRecord) -> Callable[[], object]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("asked", [audit_show, capture_page])
+@pytest.mark.parametrize("asked", [audit_show, pytest.param(capture_page, marks=pytest.mark.sweep)])
 def test_twice_as_many_viewpoints_are_twice_the_work(
     records: tuple[LargeRecord, LargeRecord], asked: Callable[[LargeRecord], Callable[[], object]]
 ) -> None:

@@ -53,7 +53,10 @@ def runs(web: WebSite) -> dict[str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", RUNS)
+@pytest.mark.parametrize(
+    "which",
+    [pytest.param(which, marks=pytest.mark.sweep(always=which in ("completed", "accepted"))) for which in RUNS],
+)
 def test_one_list_of_deviations_stands_everywhere(
     web: WebSite, runs: dict[str, str], which: str, tmp_path: Path
 ) -> None:

@@ -121,7 +121,7 @@ def referring(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recorded", ["folder", "referring"])
+@pytest.mark.parametrize("recorded", ["folder", pytest.param("referring", marks=pytest.mark.sweep)])
 def test_end_to_end_carries_the_change_to_the_registration(
     recorded: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,6 +60,7 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_the_depth_maps_are_fused_and_meshed_in_the_frame_of_the_poses(
     dense: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -175,7 +175,7 @@ def test_a_method_is_run_and_its_mesh_comes_back_into_the_world(name: str, datas
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize("simulated", [True, pytest.param(False, marks=pytest.mark.sweep)])
 @pytest.mark.usefixtures("stand_ins")
 def test_meshes_and_pictures_of_a_simulated_data_set_say_so(
     dataset: DataSet, tmp_path: Path, simulated: bool

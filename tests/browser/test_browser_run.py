@@ -245,6 +245,7 @@ def sign(page: Page, password: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep  # each of these alone: test_browser_forms.py, test_browser_pages.py, test_screen_runner.py
 def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a_capture(
     server: Served, browser: Browser, rig: dict[str, Any], people: None
 ) -> None:

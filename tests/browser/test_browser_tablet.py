@@ -34,7 +34,9 @@ def box(page: Page, selector: str) -> FloatRect:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("size", "least_px"), [((1024, 768), 430), ((1280, 800), 460)])
+@pytest.mark.parametrize(
+    ("size", "least_px"), [((1024, 768), 430), pytest.param((1280, 800), 460, marks=pytest.mark.sweep)]
+)
 def test_the_step_has_most_of_a_small_screen(
     server: Served, browser: Browser, size: tuple[int, int], least_px: int
 ) -> None:

@@ -188,6 +188,7 @@ def test_an_arm_is_corrected_whether_its_calibration_is_lost_or_its_gears_err(
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_few_images_state_how_well_they_place_the_camera() -> None:
     """Lengths that err by 0.5 mm move the camera along its axis; before, it was off by 2.0 stated sigmas, rms."""
     rows = [hand_eye_of("both", "demonstration, 14 images", seed) for seed in (110, 112)]

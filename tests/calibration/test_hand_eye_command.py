@@ -51,7 +51,7 @@ def test_poses_that_fit_give_the_mount(photographs: BoardFolder, tmp_path: Path)
     ("change", "words", "remedy"),
     [
         (inverse, "fit inverted: either the file holds T_flange_base, or the camera stands", "--setup eye-to-hand"),
-        (_in_millimetres, "fit in millimetres", "Write positions in metres"),
+        pytest.param(_in_millimetres, "fit in millimetres", "Write positions in metres", marks=pytest.mark.sweep),
     ],
 )
 def test_poses_that_are_read_wrongly_are_refused_and_the_mistake_is_named(

@@ -73,7 +73,16 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause", "resume --help"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--help",
+        pytest.param("--version", marks=pytest.mark.sweep),
+        "status latest",
+        pytest.param("act pause", marks=pytest.mark.sweep),
+        pytest.param("resume --help", marks=pytest.mark.sweep),
+    ],
+)
 def test_it_starts_without_numerics(words: str, data: Path) -> None:
     folder = () if "--" in words else ("--data", str(data))
     outcome = said_by(LOADED, *words.split(), *folder)

@@ -81,8 +81,8 @@ def bits(value: object) -> object:
 def test_outlines_have_the_same_bits_in_one_process_in_local_ones_and_on_a_cluster(
     cluster: Cluster, tmp_path: Path
 ) -> None:
-    made = scene(5, 480, seed=21)
-    files = [tmp_path / f"view_{i}.jpg" for i in range(5)]
+    made = scene(3, 400, seed=21)
+    files = [tmp_path / f"view_{i}.jpg" for i in range(3)]
     for i, file in enumerate(files):
         assert cv2.imwrite(str(file), render(made.camera, made.centres_camera(i, EVERYTHING), i, oversample=2))
     posed = PosedImages(made.T_world_camera, made.camera)
@@ -97,11 +97,12 @@ def test_outlines_have_the_same_bits_in_one_process_in_local_ones_and_on_a_clust
     assert outlines(2) == alone
     with on(cluster), noting_places() as places:
         assert outlines(2) == alone
-    assert sum(places.values()) >= 10
+    assert sum(places.values()) >= 2 * len(files)
     assert all(place.host and place.processor for place in places)
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_the_corners_of_a_board_have_the_same_bits_too(cluster: Cluster, tmp_path: Path) -> None:
     board = Board(7, 5, 0.02)
     folder = board_folder(tmp_path, board, count=3).images

@@ -50,7 +50,7 @@ BUMPY = Surface(BALL.vertices_m * (1 + 0.02 * np.sin(800 * BALL.vertices_m[:, :1
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 1000), spacing=st.floats(2.5e-4, 5e-4))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 def test_equal_surfaces_have_the_floor_and_no_distance_to_the_faces(seed: int, spacing: float) -> None:
     score = chamfer(BUMPY, BUMPY, ChamferSettings(spacing_m=spacing, seed=seed))
     assert score.chamfer_m == pytest.approx(score.floor_m, rel=0.03)
@@ -60,7 +60,7 @@ def test_equal_surfaces_have_the_floor_and_no_distance_to_the_faces(seed: int, s
 
 
 @given(offset=st.floats(2e-3, 15e-3), seed=st.integers(0, 100))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 def test_a_plane_shifted_along_its_normal_is_off_by_the_shift(offset: float, seed: int) -> None:
     score = chamfer(shifted(plane(), (0, 0, offset)), plane(), ChamferSettings(spacing_m=5e-4, seed=seed))
     assert score.chamfer_m == pytest.approx(offset, rel=0.03)
@@ -72,7 +72,7 @@ def test_a_plane_shifted_along_its_normal_is_off_by_the_shift(offset: float, see
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 100), scale=st.floats(0.8, 1.3))
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 def test_exchanging_the_surfaces_exchanges_the_directions(seed: int, scale: float) -> None:
     other = Surface(BALL.vertices_m * scale, BALL.faces)
     chosen = ChamferSettings(spacing_m=5e-4, seed=seed)
@@ -84,7 +84,7 @@ def test_exchanging_the_surfaces_exchanges_the_directions(seed: int, scale: floa
 
 @pytest.mark.slow
 @given(vector=st.tuples(*[st.floats(-3, 3)] * 3), shift=st.tuples(*[st.floats(-1, 1)] * 3))
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 def test_a_rigid_motion_of_both_changes_nothing(
     vector: tuple[float, float, float], shift: tuple[float, float, float]
 ) -> None:
@@ -289,7 +289,7 @@ def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spacing_mm", [0.1, 0.4])
+@pytest.mark.parametrize("spacing_mm", [0.1, pytest.param(0.4, marks=pytest.mark.sweep)])
 def test_the_picture_of_a_small_surface_has_no_paper_between_its_samples(tmp_path: Path, spacing_mm: float) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
     ball.export(tmp_path / "gt.ply")

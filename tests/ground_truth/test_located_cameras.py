@@ -19,6 +19,7 @@ from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 
 @pytest.mark.slow
+@pytest.mark.sweep  # within a step: test_ground_truth_step.py
 @pytest.mark.timeout(300)
 def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> None:
     run = read_run(unpack_recorded_run(tmp_path / "recorded"), "latest")

@@ -78,6 +78,7 @@ def test_a_run_develops_its_raw_files_and_measures_in_them(folder: Path, protoco
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 @pytest.mark.timeout(600)
 def test_a_run_without_raw_files_says_which_are_missing(folder: Path, protocol: Path, tmp_path: Path) -> None:
     alone = Path(shutil.copytree(folder, tmp_path / "alone"))

@@ -173,7 +173,9 @@ def last_second(arm: RobotArm) -> tuple[RobotSample, ...]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("version", ["1", "2.5", "2.7"])
+@pytest.mark.parametrize(
+    "version", ["1", pytest.param("2.5", marks=pytest.mark.sweep), pytest.param("2.7", marks=pytest.mark.sweep)]
+)
 def test_its_samples_are_the_pose_stream(version: str) -> None:
     host = address(91)
     with simulated_kuka(host, "--fri-version", version), opened(host) as arm:

@@ -99,7 +99,7 @@ def test_settings_and_exposures(way: dict[str, str], tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("camera_on")
-@pytest.mark.parametrize("name", ["Mono8", "BayerRG8", "RGB8"])
+@pytest.mark.parametrize("name", ["Mono8", "BayerRG8", pytest.param("RGB8", marks=pytest.mark.sweep)])
 def test_the_picture_is_what_the_camera_saw(name: str, way: dict[str, str], tmp_path: Path) -> None:
     with opened(way, pixel_format=name) as camera:
         camera.apply(SET)

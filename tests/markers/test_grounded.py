@@ -133,7 +133,7 @@ def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
 
 @pytest.mark.slow
 @needs_torch
-@pytest.mark.parametrize("how", ["damaged", "another network"])
+@pytest.mark.parametrize("how", ["damaged", pytest.param("another network", marks=pytest.mark.sweep)])
 def test_other_weights_are_refused(tiny: Weights, tmp_path: Path, how: str) -> None:
     for model in ("grounding-dino", "sam2"):
         (tmp_path / model).mkdir()

@@ -172,7 +172,7 @@ def completed(site: WebSite) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("act", ["release", "correct"])
+@pytest.mark.parametrize("act", ["release", pytest.param("correct", marks=pytest.mark.sweep)])
 def test_where_accounts_exist_only_the_role_may_and_only_with_its_password(
     site: WebSite, completed: str, act: str
 ) -> None:

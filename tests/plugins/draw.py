@@ -2,7 +2,7 @@
 
 `pytest --draw SEED` keeps every test but those marked `whole` or `sweep`, of which it keeps a tenth, chosen by the
 seed (continuous integration gives the commit's hash), and prints which. Of every matrix, however small, at least one
-row is drawn. Tests and rows marked `whole(always=True)` or `sweep(always=True)` are kept whatever the seed. Without
+row runs. Tests and rows marked `whole(always=True)` or `sweep(always=True)` are kept whatever the seed. Without
 `--draw` all of them run.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 import pytest
 
@@ -27,19 +27,21 @@ def drawn(seed: str, units: Iterable[str]) -> set[str]:
     return set(ranked[: -(-len(ranked) // ONE_IN)])
 
 
-def drawn_rows(seed: str, rows: Iterable[str]) -> set[str]:
-    """Return a tenth of each parametrised test's rows, at least one; tests of a single row are drawn together.
+def drawn_rows(seed: str, rows: Iterable[str], covered: Container[str] = ()) -> set[str]:
+    """Return a tenth of the rows, of each parametrised test at least one, unless it is one of those `covered`.
+
+    These have rows that always run. Their other rows are drawn together with the tests that have no parameters.
 
     >>> large, small = [f"t.py::large[{i}]" for i in range(30)], ["t.py::small[a]", "t.py::small[b]"]
-    >>> single = [f"t.py::single_{i}" for i in range(12)]
-    >>> kept = drawn_rows("a", [*large, *small, *single])
-    >>> [len(kept & set(rows)) for rows in (large, small, single)]
+    >>> others = [*(f"t.py::covered[{i}]" for i in range(6)), *(f"t.py::single_{i}" for i in range(6))]
+    >>> kept = drawn_rows("a", [*large, *small, *others], {"t.py::covered"})
+    >>> [len(kept & set(rows)) for rows in (large, small, others)]
     [3, 1, 2]
     """
     matrices: dict[str, list[str]] = defaultdict(list)
     for row in rows:
         test, bracket, _ = row.partition("[")
-        matrices[test if bracket else ""].append(row)
+        matrices[test if bracket and test not in covered else ""].append(row)
     return {row for matrix in matrices.values() for row in drawn(seed, matrix)}
 
 
@@ -54,16 +56,19 @@ class Draw:
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
         """Deselect what was not drawn: whole runs by file, since a file's tests share one; sweeps row by row."""
         left_out: set[pytest.Item] = set()
-        for mark, draw in (("whole", drawn), ("sweep", drawn_rows)):
-            units: dict[str, list[pytest.Item]] = {}
-            for item in items:
-                found = item.get_closest_marker(mark)
-                if found is not None and not found.kwargs.get("always", False):
-                    unit = item.nodeid.partition("::")[0] if mark == "whole" else item.nodeid
-                    units.setdefault(unit, []).append(item)
-            kept = draw(self._seed, units)
-            self._kept[mark] = (len(units), sorted(kept))
-            left_out.update(item for unit, members in units.items() if unit not in kept for item in members)
+        units: dict[str, dict[str, list[pytest.Item]]] = {"whole": {}, "sweep": {}}
+        covered: set[str] = set()
+        for item in items:
+            mark = next(filter(None, map(item.get_closest_marker, units)), None)
+            if mark is None or mark.kwargs.get("always", False):
+                covered.add(item.nodeid.partition("[")[0])
+            else:
+                unit = item.nodeid.partition("::")[0] if mark.name == "whole" else item.nodeid
+                units[mark.name].setdefault(unit, []).append(item)
+        for mark, of_mark in units.items():
+            kept = drawn(self._seed, of_mark) if mark == "whole" else drawn_rows(self._seed, of_mark, covered)
+            self._kept[mark] = (len(of_mark), sorted(kept))
+            left_out.update(item for unit, members in of_mark.items() if unit not in kept for item in members)
         config.hook.pytest_deselected(items=[item for item in items if item in left_out])
         items[:] = [item for item in items if item not in left_out]
 

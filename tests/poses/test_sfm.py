@@ -106,6 +106,7 @@ def test_both_mappers_share_features_and_find_the_poses(
 
 
 @pytest.mark.slow
+@pytest.mark.sweep  # as jobs: test_front_end_jobs.py
 def test_pieces_in_any_order_make_the_same_model(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
 ) -> None:

@@ -110,7 +110,7 @@ def test_noise_is_estimated_and_covariances_are_honest() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", [True, False])
+@pytest.mark.parametrize("robot", [True, pytest.param(False, marks=pytest.mark.sweep)])
 def test_covariance_is_honest_with_little_texture(robot: bool) -> None:
     """Far fewer tracks than parameters: 30 points in 40 images, of which each image sees some 21."""
     ratios: list[float] = []
@@ -164,7 +164,7 @@ def test_a_wrong_principal_point_is_found_with_the_calibration_as_prior() -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", [True, False])
+@pytest.mark.parametrize("robot", [True, pytest.param(False, marks=pytest.mark.sweep)])
 def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> None:
     """Cameras with errors of their calibration's covariance: without it the stated sigma is far too small."""
     names, sigmas = ("fx", "fy", "cx", "cy", "k1"), np.array([4.0, 4.0, 2.0, 2.0, 0.004])

@@ -133,7 +133,9 @@ def located(folder: Path, seed: int, *, by_hand: bool) -> Located:
     return Located(register.KIND.read_answer(answer.result), names, covariance, true)
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["without poses", "by hand"])
+@pytest.fixture(
+    scope="module", params=[pytest.param(False, marks=pytest.mark.sweep), True], ids=["without poses", "by hand"]
+)
 def answers(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Located]:
     return [
         located(tmp_path_factory.mktemp("scene"), seed, by_hand=bool(request.param)) for seed in range(1, SCENES + 1)

@@ -93,6 +93,7 @@ def glossy(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_scanned_spheres_are_where_they_are(sprayed: Scanned, glossy: Scanned) -> None:
     for scan, centres in (
         (sprayed, SCENE.registration_m),
@@ -107,6 +108,7 @@ def test_scanned_spheres_are_where_they_are(sprayed: Scanned, glossy: Scanned) -
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_the_scan_is_in_a_frame_of_its_own_and_in_millimetres(sprayed: Scanned, glossy: Scanned) -> None:
     assert sprayed.mesh.unit == "mm"
     assert np.linalg.det(sprayed.T_world_scan[:3, :3]) == pytest.approx(1.0)
@@ -124,6 +126,7 @@ def test_the_underside_and_what_lies_deep_are_missing(coarse: Scanned) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_without_spray_more_is_missing(sprayed: Scanned, glossy: Scanned) -> None:
     assert glossy.mesh.findings["holes"] > 3 * sprayed.mesh.findings["holes"]
     assert glossy.tissue_area_m2() < 1.1 * sprayed.tissue_area_m2()
@@ -137,7 +140,7 @@ def test_normals_face_outwards(coarse: Scanned) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["obj", "stl"])
+@pytest.mark.parametrize("form", ["obj", pytest.param("stl", marks=pytest.mark.sweep)])
 def test_other_formats_hold_the_same_scan(tmp_path: Path, form: str) -> None:
     scan = scanned(tmp_path, "--format", form, "--spacing-mm", "1.2", "--spray")
     fit = fit_sphere(scan.world_m, SCENE.registration_m[4], 0.3e-3)

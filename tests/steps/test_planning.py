@@ -331,7 +331,7 @@ def test_a_person_sees_the_plan_before_confirming(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", ["intrinsics", "hand_eye"])
+@pytest.mark.parametrize("step", ["intrinsics", pytest.param("hand_eye", marks=pytest.mark.sweep)])
 def test_the_papers_board_images_are_planned_from_files_alone(tmp_path: Path, step: str) -> None:
     lens = "lens: {focal_length_mm: 50, sensor_width_mm: 35.7, image_px: [1920, 1280]}\n"
     (tmp_path / "rig.yaml").write_text(RIG + "collision: {arm: UR10e}\n" + lens)

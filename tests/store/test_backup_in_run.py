@@ -38,6 +38,7 @@ def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], l
 
 
 @pytest.mark.slow
+@pytest.mark.sweep  # on the bench: test_backup.py
 def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tmp_path: Path) -> None:
     data, restored = tmp_path / "data", tmp_path / "restored"
     with simulated_rig(

@@ -77,7 +77,7 @@ def sweep(data: Path, crash_at: int | None) -> tuple[CrashingFiles, bool]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("power_lost", [False, True])
+@pytest.mark.parametrize("power_lost", [False, pytest.param(True, marks=pytest.mark.sweep)])
 def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power_lost: bool) -> None:
     shutil.copytree(before, tmp_path / "whole")
     points = sweep(tmp_path / "whole", None)[0].points

@@ -91,8 +91,8 @@ def test_make_targets_do_what_the_documents_say() -> None:
     with_realtime = "$(grep -rlwE 'realtime' tests --include='test_*.py')"
     for target, last in (
         ("test", '.venv/bin/pytest -m "not (slow or realtime or packages or whole or sweep)" --ignore=tests/browser'),
-        ("test-all", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
-        ("test-realtime", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
+        ("test-all", f".venv/bin/pytest -m realtime -n 2 {with_realtime}"),
+        ("test-realtime", f".venv/bin/pytest -m realtime -n 2 {with_realtime}"),
         ("test-whole", ".venv/bin/pytest -m whole"),
         ("test-sweeps", ".venv/bin/pytest -m sweep"),
         ("marks", ".venv/bin/ruff format --quiet tests"),

@@ -20,7 +20,11 @@ from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(1800)]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.whole,
+    pytest.mark.timeout(1800),
+]  # a shorter run in every submission: test_browser_run.py
 
 STEP_S = 400  # after which a step, of seconds on a quiet machine, does not end any more
 
