@@ -20,11 +20,8 @@ from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.whole,
-    pytest.mark.timeout(1800),
-]  # a shorter run in every submission: test_browser_run.py
+# A shorter run is led through the browser in every submission: test_browser_run.py.
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(1800)]
 
 STEP_S = 400  # after which a step, of seconds on a quiet machine, does not end any more
 
