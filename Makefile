@@ -62,7 +62,7 @@ test-versions:
 lint: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --threads 2
+	$(BIN)/pyright
 	$(BIN)/lint-imports
 	$(BIN)/python -m bench.suite.dialect --check
 	$(BIN)/python -m bench.suite.marks --check

@@ -56,7 +56,7 @@ def pytest_in(folder: Path, source: str, *words: str, conftest: str = "") -> sub
 
 def test_a_tenth_is_drawn_by_the_seed_and_every_unit_has_its_turn() -> None:
     units = [f"tests/test_{number}.py" for number in range(25)]
-    assert len(drawn("a", units)) == 3
+    assert len(drawn("a", units)) == 2
     assert drawn("a", units) == drawn("a", reversed(units))
     assert set.union(*(drawn(str(seed), units) for seed in range(100))) == set(units)
     assert drawn("a", []) == set()
@@ -71,11 +71,14 @@ def test_always(): pass
 @pytest.mark.sweep
 @pytest.mark.parametrize("row", range(20))
 def test_row(row): pass
+always, sweep = pytest.mark.sweep(always=True), pytest.mark.sweep
+@pytest.mark.parametrize("row", [pytest.param(0, marks=always), *(pytest.param(k, marks=sweep) for k in range(1, 9))])
+def test_covered(row): pass
 def test_other(): pass
 """
     answer = pytest_in(tmp_path, source, "--draw", "seed")
-    assert "drawn by seed: 2 of 20 marked sweep" in answer.stdout
-    assert "4 passed, 18 deselected" in answer.stdout
+    assert "drawn by seed: 3 of 28 marked sweep" in answer.stdout
+    assert "6 passed, 25 deselected" in answer.stdout
 
 
 @pytest.mark.slow
