@@ -45,7 +45,7 @@ def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
     known = nominal(tolerances)
     found = board_candidates(known, BOARD, wishes, APPROACH)
     assert len(found.T_base_camera) > 20
-    hands, boards, zoom, shift = known.draws(100, seed=99)  # not those that the planner has used
+    hands, boards, zoom, shift = known.draws(200, seed=99)  # not those that the planner has used
     size = np.array([CAMERA.width, CAMERA.height])
     cut = 0
     for T in found.T_base_camera:
@@ -54,7 +54,7 @@ def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
             lens = dataclasses.replace(CAMERA, fx=CAMERA.fx * z, fy=CAMERA.fy * z)
             pixels = lens.project(seen) + s
             cut += not ((pixels > 12) & (pixels < size - 13)).all()
-    assert cut <= 0.001 * 100 * len(found.T_base_camera)
+    assert cut <= 0.001 * 200 * len(found.T_base_camera)
 
 
 def test_a_design_covers_the_image_and_predicts_what_its_images_come_to() -> None:
