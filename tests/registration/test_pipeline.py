@@ -83,14 +83,6 @@ def test_overlay_draws_on_a_copy(captured: Captured) -> None:
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_outlines(captured: Captured) -> None:
-    made, paths, outlines = captured
-    again = detect_all(paths[:2], made.camera, workers=2)
-    for a, b in zip(again, outlines, strict=False):
-        assert [o.centre_px for o in a] == [o.centre_px for o in b]
-
-
-@pytest.mark.slow
 def test_half_a_jpeg_is_refused_by_name(captured: Captured, tmp_path: Path) -> None:
     made, paths, _ = captured
     data = paths[0].read_bytes()
