@@ -34,8 +34,8 @@ def drawn_rows(seed: str, rows: Iterable[str], covered: Container[str] = ()) -> 
 
     >>> large, small = [f"t.py::large[{i}]" for i in range(30)], ["t.py::small[a]", "t.py::small[b]"]
     >>> others = [*(f"t.py::covered[{i}]" for i in range(6)), *(f"t.py::single_{i}" for i in range(6))]
-    >>> kept = drawn_rows("a", [*large, *small, *others], {"t.py::covered"})
-    >>> [len(kept & set(rows)) for rows in (large, small, others)]
+    >>> chosen = drawn_rows("a", [*large, *small, *others], {"t.py::covered"})
+    >>> [len(chosen & set(rows)) for rows in (large, small, others)]
     [3, 1, 1]
     """
     matrices: dict[str, list[str]] = defaultdict(list)
