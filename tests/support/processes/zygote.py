@@ -28,6 +28,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
+from tests.support.processes.garbage import look_for_garbage_rarely
 from tests.support.processes.quick_hashes import hash_quickly
 
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
@@ -169,6 +170,7 @@ class _Zygote:
             with contextlib.suppress(ModuleNotFoundError):  # the library of a device may not be installed
                 importlib.import_module(name)
         hash_quickly()
+        _do_once_for_all()
         assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"
         gc.collect()
         gc.freeze()  # the children's collections leave alone, and so share, what is here
@@ -189,6 +191,16 @@ class _Zygote:
         """Terminate what still runs: the tests are no more."""
         for pidfd in self.children:
             signal.pidfd_send_signal(pidfd, signal.SIGTERM)
+
+
+def _do_once_for_all() -> None:
+    """Do what most children would do first, as far as they import what it takes."""
+    if "service.core.declared_kinds" in sys.modules:
+        sys.modules["service.core.declared_kinds"].plug_ins("")  # searches the installed packages
+    if "service.core.protocol.models" in sys.modules and "service.store.events" in sys.modules:
+        importlib.import_module("tests.support.processes.first_reading").read_once()
+    if "service.web.page.rendering" in sys.modules:
+        importlib.import_module("tests.support.pages.compiled_templates").keep_compiled_templates()
 
 
 def _changed(before: dict[str, str]) -> dict[str, str]:
@@ -300,6 +312,7 @@ def _leave_at_once() -> None:
 if __name__ == "__main__":
     atexit.register(_leave_at_once)  # before all others, so that it is called after them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
+    look_for_garbage_rarely()
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
     _fresh = True  # whether it is a fork that has no zygote of its own yet
