@@ -15,7 +15,7 @@ COMPILED = Path(__file__).parents[3] / "build" / "templates"
 
 @cache
 def keep_compiled_templates() -> None:
-    """Let this process and its forks keep the templates that they compile, and use those that others have kept."""
+    """Let this process and its forks use templates that another of the tests has compiled, and add theirs."""
     settings = hashlib.sha256(Path(rendering.__file__).read_bytes()).hexdigest()[:12]
     COMPILED.mkdir(parents=True, exist_ok=True)
     names = f"jinja-{jinja2.__version__}-{settings}-%s.cache"
