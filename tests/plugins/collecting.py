@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes.garbage import look_for_garbage_rarely
+from tests.support.processes.memory import spend_memory_rather_than_time
 
 TESTS = Path(__file__).parents[1]
 _BROWSER = "tests/browser/"  # its files share a browser, which ends with the last of those that run in a row
@@ -40,7 +40,7 @@ def pytest_collection() -> Generator[None, object, object]:
         return (yield)
     finally:
         gc.freeze()
-        look_for_garbage_rarely()
+        spend_memory_rather_than_time()
         gc.enable()
 
 

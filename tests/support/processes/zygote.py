@@ -5,7 +5,8 @@ it cannot outlive the tests. `tests.support.processes.forked` is the other end. 
 same as a fresh `python -m MODULE WORDS…` or `orthocapture WORDS…`: it leaves this module by returning from it, runs
 the program as `__main__`, and the interpreter ends it as any other: exit status, tracebacks, `atexit` and all. What
 differs from a fresh process: modules are loaded already, `ps` shows the command line of the zygote, all children of
-one zygote share the seed of `hash()`, and passwords are hashed at the least cost.
+one zygote share the seed of `hash()`, passwords are hashed at the least cost, a protocol has been read and the
+installed packages have been searched, and freed memory is kept.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
-from tests.support.processes.garbage import look_for_garbage_rarely
+from tests.support.processes.memory import spend_memory_rather_than_time
 from tests.support.processes.quick_hashes import hash_quickly
 
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
@@ -312,7 +313,7 @@ def _leave_at_once() -> None:
 if __name__ == "__main__":
     atexit.register(_leave_at_once)  # before all others, so that it is called after them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
-    look_for_garbage_rarely()
+    spend_memory_rather_than_time()
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
     _fresh = True  # whether it is a fork that has no zygote of its own yet
