@@ -7,7 +7,7 @@ import gc
 from contextlib import suppress
 
 _THRESHOLDS = (10_000, 20, 20)
-_LARGEST_KEPT, _MOST_KEPT = 32 << 20, 256 << 20  # bytes
+_LARGEST_REUSED_BYTES, _MOST_REUSED_BYTES = 32 << 20, 256 << 20
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
@@ -20,5 +20,5 @@ def spend_memory_rather_than_time() -> None:
     gc.set_threshold(*_THRESHOLDS)
     with suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT)
-        libc.mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT)
+        libc.mallopt(_M_MMAP_THRESHOLD, _LARGEST_REUSED_BYTES)
+        libc.mallopt(_M_TRIM_THRESHOLD, _MOST_REUSED_BYTES)

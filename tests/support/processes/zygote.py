@@ -6,7 +6,7 @@ same as a fresh `python -m MODULE WORDS…` or `orthocapture WORDS…`: it leave
 the program as `__main__`, and the interpreter ends it as any other: exit status, tracebacks, `atexit` and all. What
 differs from a fresh process: modules are loaded already, `ps` shows the command line of the zygote, all children of
 one zygote share the seed of `hash()`, passwords are hashed at the least cost, a protocol has been read and the
-installed packages have been searched, and freed memory is kept.
+installed packages have been searched, and freed memory stays in the process.
 """
 
 from __future__ import annotations
