@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-_AT_FIRST_S, _LONGER = 0.01, 1.5
+_AT_FIRST_S, _LONGER = 0.02, 2.0
 
 
 def until(
