@@ -53,7 +53,7 @@ _SIMULATORS = {
 
 @cache
 def simulators() -> dict[str, tuple[str, str]]:
-    """Module and description of each simulator, by name: ours, and those with an entry point of GROUP.
+    """Return module and description of each simulator, by name: ours, and those with an entry point of GROUP.
 
     The description of the latter is the first sentence of the module.
     """
@@ -67,13 +67,18 @@ def simulators() -> dict[str, tuple[str, str]]:
 
 def _load(name: str) -> SimulatorModule:
     # Imported on demand: most simulators need half a second of imports that the others do not.
-    return cast(SimulatorModule, importlib.import_module(simulators()[name][0]))
+    return cast(SimulatorModule, importlib.import_module(_rows(name)[name][0]))
+
+
+def _rows(name: str) -> dict[str, tuple[str, str]]:
+    """Return the simulator of this name, or all: to look for those of plug-ins takes longer than to start one."""
+    return {name: _SIMULATORS[name]} if name in _SIMULATORS else simulators()
 
 
 def _parser(chosen: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="orthocapture simulate", description=__doc__)
     commands = parser.add_subparsers(dest="simulator", required=True, metavar="NAME")
-    for name, (_, what) in simulators().items():
+    for name, (_, what) in _rows(chosen or "").items():
         command = commands.add_parser(name, help=what, description=what, conflict_handler="resolve")
         _common(command)
         if name == chosen:
@@ -83,7 +88,7 @@ def _parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def _described(name: str) -> dict[str, object]:
     """Return all simulators, or the options of one, as plain data, for other command lines to present."""
-    if name not in simulators():
+    if name not in _rows(name):
         return {"simulators": {known: what for known, (_, what) in simulators().items()}}
     options = argparse.ArgumentParser(add_help=False, conflict_handler="resolve")
     _common(options)
@@ -91,7 +96,7 @@ def _described(name: str) -> dict[str, object]:
     # argparse has no public list of a parser's options.
     actions: list[argparse.Action] = options._actions
     return {
-        "what": simulators()[name][1],
+        "what": _rows(name)[name][1],
         "options": [
             {
                 "flags": list(action.option_strings),
@@ -127,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if words[:1] == ["--describe"]:
         sys.stdout.write(json.dumps(_described(words[1] if len(words) > 1 else "")) + "\n")
         return 0
-    chosen = words[0] if words and words[0] in simulators() else None
+    chosen = words[0] if words and words[0] in _rows(words[0]) else None
     try:
         with _unsearched():
             args = _parser(chosen).parse_args(words)

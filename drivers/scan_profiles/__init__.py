@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import entry_points
 from typing import Literal
 
 from drivers.meshes.mesh_file import MESH_SUFFIXES
 from drivers.scan_profiles.profile import ScanProfile
+from service.core.declared_kinds import plug_ins
 
 GROUP = "orthocapture.scan_profiles"
 _MESHES: Mapping[str, Literal["mm"]] = dict.fromkeys(MESH_SUFFIXES, "mm")
@@ -70,14 +70,14 @@ PROFILES: Mapping[str, ScanProfile] = {
 @cache
 def profile_names() -> tuple[str, ...]:
     """The names of the profiles, sorted: ours, and those that other packages install."""
-    return tuple(sorted({*PROFILES, *(point.name for point in entry_points(group=GROUP))}))
+    return tuple(sorted({*PROFILES, *(point.name for point in plug_ins(GROUP))}))
 
 
 def profile_named(name: str) -> ScanProfile:
     """The profile of this name. Raises ValueError, which lists the known ones, if there is none."""
     if name in PROFILES:
         return PROFILES[name]
-    for point in entry_points(group=GROUP, name=name):
+    for point in (point for point in plug_ins(GROUP) if point.name == name):
         profile = point.load()
         if isinstance(profile, ScanProfile):
             return profile

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, distributions
 from typing import Any, Protocol, TypeVar
 
 from service.core.errors import ConfigurationError
@@ -53,15 +54,24 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
 
 
 def plug_ins(group: str) -> tuple[EntryPoint, ...]:
-    """Return the entry points of one of our groups, by name; installed packages are searched once for all groups."""
-    return _plug_ins(tuple(sys.path)).get(group, ())
+    """Return the entry points of one of our groups, by name; a folder of the path is searched once for all groups."""
+    found: dict[str, tuple[EntryPoint, ...]] = {}
+    for place in sys.path:
+        for package, points in _packages_in(place or os.getcwd()):
+            found.setdefault(package, points)
+    ours = [point for points in found.values() for point in points if point.group == group]
+    return tuple(sorted(ours, key=lambda point: point.name))
 
 
-@lru_cache(maxsize=1)
-def _plug_ins(_path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
-    found = entry_points()
-    ours = [group for group in found.groups if group.startswith("orthocapture.")]
-    return {group: tuple(sorted(found.select(group=group), key=lambda point: point.name)) for group in ours}
+@cache
+def _packages_in(place: str) -> tuple[tuple[str, tuple[EntryPoint, ...]], ...]:
+    """Return names and entry points of the packages in a folder that have some for us."""
+    found: list[tuple[str, tuple[EntryPoint, ...]]] = []
+    for package in distributions(path=[place]):
+        points = tuple(point for point in package.entry_points if point.group.startswith("orthocapture."))
+        if points:
+            found.append((package.name, points))
+    return tuple(found)
 
 
 def _modules(package: str) -> list[str]:

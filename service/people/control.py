@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, Literal
 
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from service.core.records.base import age_s
 from service.core.records.events import ControlTaken
@@ -20,6 +20,8 @@ from service.store.store import Store
 UNANSWERED_S = 60.0  # after this time a locked screen that does not answer may lose control
 _NOBODY_ASKS: Mapping[str, str | float] = {"asked_by_screen": "", "asked_by_account": "", "asked_utc_s": 0.0}
 _DECIDE_AGAIN = "Read what the page shows now and decide again; nothing was done"
+_RUN = select(runs.c.run_id).where(runs.c.run_id == bindparam("run"))  # put together once: every page asks them
+_CONTROL = select(control).where(control.c.run_id == bindparam("run"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,9 +173,9 @@ class Control:
             self._record(connection, run_id, person.account, "", holder, "free", "given back")
 
     def _holder(self, connection: Connection, run_id: str) -> Holder:
-        if connection.execute(select(runs.c.run_id).where(runs.c.run_id == run_id)).first() is None:
+        if connection.execute(_RUN, {"run": run_id}).first() is None:
             self._store.events(run_id)  # raises UnknownRunError in the store's words
-        row = connection.execute(select(control).where(control.c.run_id == run_id)).one_or_none()
+        row = connection.execute(_CONTROL, {"run": run_id}).one_or_none()
         if row is None or not row.screen:
             return Holder()
         session = self._valid(connection, row.screen)

@@ -9,7 +9,7 @@ from threading import Lock
 from typing import Any, Literal
 
 from argon2 import PasswordHasher
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from service.core.records.base import age_s
 from service.core.records.events import AccountChanged, SignInRecorded
@@ -52,6 +52,11 @@ _SCREEN_LETTERS = "23456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 KnownBy = Literal["password", "pin", "badge"]  # the secret with which a person signs
 NAMES: Mapping[KnownBy, str] = {"password": "password", "pin": "PIN", "badge": "badge"}
+_SESSION = (  # put together once: every page asks it
+    select(sessions, accounts.c.full_name, accounts.c.role, accounts.c.state)
+    .join(accounts, sessions.c.account == accounts.c.account)
+    .where(sessions.c.token_sha256 == bindparam("token"))
+)
 
 
 class People:
@@ -349,11 +354,7 @@ class People:
             connection.execute(delete(sessions).where(chosen))
 
     def _session(self, connection: Connection, token: str) -> Row[Any] | None:
-        return connection.execute(
-            select(sessions, accounts.c.full_name, accounts.c.role, accounts.c.state)
-            .join(accounts, sessions.c.account == accounts.c.account)
-            .where(sessions.c.token_sha256 == token_sha256(token))
-        ).one_or_none()
+        return connection.execute(_SESSION, {"token": token_sha256(token)}).one_or_none()
 
     def _lock(self, connection: Connection, account: str, screen: str, *, actor: str) -> None:
         changed = connection.execute(

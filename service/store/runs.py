@@ -119,6 +119,7 @@ def resolve_run(known: Sequence[RunRow], name: str) -> str:
 
 _SAME_START_S = 1.5  # the boot time is known to one second
 _HELD = select(leases.c.run_id).where(leases.c.token == bindparam("held"))  # put together once: every record asks it
+_LEASES = select(leases).order_by(leases.c.run_id)
 _log = logging.getLogger(__name__)
 
 
@@ -235,7 +236,7 @@ def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
     """Return names, sorted, of the runs whose lease is held by a process that may still be alive."""
     now_utc_s = lease_now_s(connection, clock)
-    rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
+    rows = connection.execute(_LEASES).all()
     return [row.run_id for row in rows if is_live(row, now_utc_s)]
 
 

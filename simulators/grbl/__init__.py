@@ -19,7 +19,7 @@ from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
 from simulators.world_link import WorldLink
 
-_TICK_S = 0.003
+_TICK_S, _REST_S = 0.003, 0.02  # while it moves; while nothing changes unless the host says something
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def serve(args: argparse.Namespace) -> None:
         link = None if args.link is None else str(args.link)
         announce(port=port_name, link=link, not_served=list(said.not_served))
         while not termination.is_set():
-            controller.hear(terminal.receive(_TICK_S))
+            controller.hear(terminal.receive(_TICK_S if controller.busy else _REST_S))
             now_s = time.monotonic()
             controller.advance(now_s)
             if controller.unplugged_s:

@@ -54,10 +54,17 @@ class Controller:
         self.unplugged_s = 0.0
         self._start_anew(self._said.state or ("Alarm" if self._machine.settings[22] else "Idle"))
 
+    @property
+    def busy(self) -> bool:
+        """Return whether something changes by itself."""
+        return self._machine.travelling or self._door_s > 0
+
     # --- the line ----------------------------------------------------------------------------------------
 
     def hear(self, data: bytes) -> None:
         """Take bytes: real-time commands act at once, lines wait for their turn."""
+        if not data:
+            return
         for byte in data:
             if byte in _REALTIME:
                 self._act(byte)

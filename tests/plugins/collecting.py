@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.processes.memory import spend_memory_rather_than_time
+
 TESTS = Path(__file__).parents[1]
 _BROWSER = "tests/browser/"  # its files share a browser, which ends with the last of those that run in a row
 _UNKNOWN_S = 100.0  # of a test that is not on the list: of a whole run, which is begun before all others
@@ -38,6 +40,7 @@ def pytest_collection() -> Generator[None, object, object]:
         return (yield)
     finally:
         gc.freeze()
+        spend_memory_rather_than_time()
         gc.enable()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import unescape
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from service.web.page.run_frame import RunStanding, run_standing
 from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import ShownSite, shown_site
 from tests.support.pages.states import BEGUN
-from tests.support.pages.web import Browser, WebSite, web_site
+from tests.support.pages.web import WebSite, web_site
 
 _PAGES = ("", "/capture", "/scene", "/calibration", "/dataset")
 _STATES = (
@@ -50,6 +50,14 @@ class Shown:
 
     web: WebSite
     runs: dict[str, str]
+    homes: dict[Role, tuple[str, ...]] = field(default_factory=dict[Role, tuple[str, ...]])
+
+    def home(self, role: Role) -> tuple[str, ...]:
+        """The first page, which is the same for all runs: both parts of its list."""
+        if role not in self.homes:
+            browser = self.web.browser(role)
+            self.homes[role] = tuple(browser.get("/", params={"page": page}).text for page in (1, 2))
+        return self.homes[role]
 
     def stands(self, which: str) -> RunStanding:
         log = self.web.site.run(self.runs[which])
@@ -98,7 +106,7 @@ def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
         goes_on = re.search(r"<span data-goes-on( hidden)?>", html)
         assert goes_on is not None
         assert bool(goes_on[1]) == (stands.mode == "ended"), page  # nothing goes on in a run that has ended
-    _listed(browser, run_id, stands)
+    _listed(shown.home(role), run_id, stands)
     _guided(pages[""], stands, role)
     _counted(shown, pages[""], which)
 
@@ -112,9 +120,8 @@ def test_a_stopped_or_lost_arm_is_said_before_all_else(shown: Shown) -> None:
         assert said[which].alert.lower().startswith(said[which].why.lower())
 
 
-def _listed(browser: Browser, run_id: str, stands: RunStanding) -> None:
+def _listed(pages: tuple[str, ...], run_id: str, stands: RunStanding) -> None:
     """What the first page says of the run."""
-    pages = [browser.get("/", params={"page": page}).text for page in (1, 2)]
     mine = f'href="/runs/{run_id}"'
     if stands.mode == "ended":
         (row,) = {row for home in pages for row in home.split("<tr") if mine in row}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import entry_points
 
 from drivers.errors import DeviceRefusedError
 from drivers.gphoto.profile import Profile
+from service.core.declared_kinds import plug_ins
 
 GROUP = "orthocapture.camera_profiles"
 
@@ -14,7 +14,7 @@ GROUP = "orthocapture.camera_profiles"
 @cache
 def profiles() -> dict[str, Profile]:
     """The installed profiles, by name."""
-    found = {point.name: point.load() for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+    found = {point.name: point.load() for point in plug_ins(GROUP)}
     return {name: profile for name, profile in found.items() if isinstance(profile, Profile)}
 
 

@@ -392,8 +392,9 @@ class Marginal:
 
 def marginalise(blocks: Blocks, root: Array, factor: float) -> Marginal:
     """Integrate out the pose errors, xi_i = root_i z with z ~ N(0, I); `root` is (N, 6, 6), zero for exact poses."""
-    inner = np.eye(6) + np.einsum("nji,njk,nkl->nil", root, blocks.AA, root) / factor
-    Q = np.einsum("nij,njk,nlk->nil", root, np.linalg.inv(inner), root)
+    root_T = root.transpose(0, 2, 1)
+    inner = np.eye(6) + root_T @ blocks.AA @ root / factor
+    Q = root @ np.linalg.inv(inner) @ root_T
     JQ = blocks.JA @ Q
     n = len(blocks.JJ)
     left = JQ.transpose(1, 0, 2).reshape(n, -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Annotated, ClassVar, Literal
 
 from service.compute.planning.motion_plan import Order
@@ -103,7 +104,6 @@ class _Capture:
         ]
         self.live = LiveAnalysis.begin(context, params.live)
         self.last = params.viewpoints[-1]
-        self._extra = denser_viewpoints(self.last, context.devices.layout(self.last.station))
         if self.live is not None:
             wanted = self.live.suggested()
             plan += [viewpoint for viewpoint in self._extra if viewpoint.name in wanted]
@@ -113,6 +113,11 @@ class _Capture:
         self._features = EarlyFeatures.begin(context, plan)
         self.plan = self._planned([v for v in plan if v.name not in done])
         self.viewpoints = [*self.plan.viewpoints, *(v for v in plan if v.name in done)]
+
+    @cached_property
+    def _extra(self) -> tuple[Viewpoint, ...]:
+        """Further viewpoints of the last set, which only the analysis of the images may ask for."""
+        return denser_viewpoints(self.last, self._context.devices.layout(self.last.station))
 
     def _planned(self, viewpoints: Sequence[Viewpoint]) -> StepPlan:
         """Plan the motions from where the arms stand."""

@@ -421,8 +421,10 @@ def _engine(address: str, *, writable: bool) -> Engine:
             raise
 
     def on_begin(connection: Connection) -> None:
-        writes = connection.get_execution_options().get("writes", False)
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+        if connection.get_execution_options().get("writes", False):
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        else:  # by the driver itself, which takes a tenth of the time: pages read many times
+            connection.connection.cursor().execute("BEGIN")
 
     event.listen(engine, "connect", on_connect)
     event.listen(engine, "begin", on_begin)

@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.serialization import (
     PublicFormat,
     load_pem_private_key,
 )
-from sqlalchemy import Connection, Row, insert, select
+from sqlalchemy import Connection, Row, bindparam, insert, select
 
 from service.store.access import KEYS
 from service.store.database.tables import artefacts, checkpoints, events, timestamps
@@ -28,6 +28,9 @@ from service.store.records import SITE, Checkpoint, SigningKeyError, Timestamp
 
 PURPOSE = "orthocapture checkpoint v1"  # keeps a signature from being used for anything else
 _COLUMNS = tuple(field.name for field in fields(Checkpoint))
+_NEWEST = (  # put together once: every signature asks it several times
+    select(checkpoints).where(checkpoints.c.run_id == bindparam("run")).order_by(checkpoints.c.seq.desc()).limit(1)
+)
 
 
 def statement(checkpoint: Checkpoint) -> bytes:
@@ -83,8 +86,7 @@ def insert_checkpoint(connection: Connection, checkpoint: Checkpoint) -> None:
 
 def last_checkpoint(connection: Connection, run_id: str) -> Checkpoint | None:
     """Return the newest checkpoint of a run, or None."""
-    newest = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq.desc()).limit(1)
-    row = connection.execute(newest).one_or_none()
+    row = connection.execute(_NEWEST, {"run": run_id}).one_or_none()
     return None if row is None else to_checkpoint(row)
 
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, bindparam, select
 
 from service.core.errors import IntegrityError
 from service.store.database.tables import events
 from service.store.events import ROOT
 from service.store.store import Store
 from service.store.verification.chain_checks import Fault, chain_fault
+
+# Put together once: every signature asks them several times.
+_ONE = select(events).where(events.c.run_id == bindparam("run"), events.c.seq == bindparam("last"))
+_AFTER = (
+    select(events).where(events.c.run_id == bindparam("run"), events.c.seq > bindparam("last")).order_by(events.c.seq)
+)
 
 
 def require_sound(store: Store, connection: Connection, run_id: str) -> None:
@@ -36,9 +42,9 @@ def require_sound(store: Store, connection: Connection, run_id: str) -> None:
 
 def _chain(store: Store, connection: Connection, run_id: str) -> Fault | tuple[int, str]:
     end = store.sound_until.get(run_id, (0, ROOT))
-    rows = select(events).where(events.c.run_id == run_id).order_by(events.c.seq)
+    place = {"run": run_id, "last": end[0]}
     if end[0]:
-        before = connection.execute(rows.where(events.c.seq == end[0])).mappings().one_or_none()
+        before = connection.execute(_ONE, place).mappings().one_or_none()
         if before is None or before["sha256"] != end[1]:
             return Fault(run_id, end[0], "", "this event is not the one that was here before")
-    return chain_fault(run_id, connection.execute(rows.where(events.c.seq > end[0])).mappings(), end)
+    return chain_fault(run_id, connection.execute(_AFTER, place).mappings(), end)

@@ -26,6 +26,7 @@ from service.store.store import Store
 from service.web.app import create_app
 from service.web.security import cookie_name
 from service.web.site import Launcher, Site
+from tests.support.pages.compiled_templates import keep_compiled_templates
 from tests.support.processes.forked import pages_fork
 from tests.support.processes.quick_hashes import QuickHasher
 from tests.support.record.stepped_clock import SteppedClock
@@ -156,6 +157,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
 
     Time stands still there, but for waits, unless another clock is given.
     """
+    keep_compiled_templates()
     rig_file = folder / "rig.yaml"
     rig_file.write_text("name: bench\nsimulated: true\ndevices: {}\n")
     protocols = folder / "protocols"

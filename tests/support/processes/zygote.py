@@ -5,7 +5,8 @@ it cannot outlive the tests. `tests.support.processes.forked` is the other end. 
 same as a fresh `python -m MODULE WORDS…` or `orthocapture WORDS…`: it leaves this module by returning from it, runs
 the program as `__main__`, and the interpreter ends it as any other: exit status, tracebacks, `atexit` and all. What
 differs from a fresh process: modules are loaded already, `ps` shows the command line of the zygote, all children of
-one zygote share the seed of `hash()`, and passwords are hashed at the least cost.
+one zygote share the seed of `hash()`, passwords are hashed at the least cost, a protocol has been read and the
+installed packages have been searched, and freed memory stays in the process.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
+from tests.support.processes.memory import spend_memory_rather_than_time
 from tests.support.processes.quick_hashes import hash_quickly
 
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
@@ -169,6 +171,7 @@ class _Zygote:
             with contextlib.suppress(ModuleNotFoundError):  # the library of a device may not be installed
                 importlib.import_module(name)
         hash_quickly()
+        _do_once_for_all()
         assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"
         gc.collect()
         gc.freeze()  # the children's collections leave alone, and so share, what is here
@@ -189,6 +192,16 @@ class _Zygote:
         """Terminate what still runs: the tests are no more."""
         for pidfd in self.children:
             signal.pidfd_send_signal(pidfd, signal.SIGTERM)
+
+
+def _do_once_for_all() -> None:
+    """Do what most children would do first, as far as they import what it takes."""
+    if "service.core.declared_kinds" in sys.modules:
+        sys.modules["service.core.declared_kinds"].plug_ins("")  # searches the installed packages
+    if "service.core.protocol.models" in sys.modules and "service.store.events" in sys.modules:
+        importlib.import_module("tests.support.processes.first_reading").read_once()
+    if "service.web.page.rendering" in sys.modules:
+        importlib.import_module("tests.support.pages.compiled_templates").keep_compiled_templates()
 
 
 def _changed(before: dict[str, str]) -> dict[str, str]:
@@ -300,6 +313,7 @@ def _leave_at_once() -> None:
 if __name__ == "__main__":
     atexit.register(_leave_at_once)  # before all others, so that it is called after them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
+    spend_memory_rather_than_time()
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
     _fresh = True  # whether it is a fork that has no zygote of its own yet
