@@ -81,7 +81,7 @@ class ExportFolder:
     def __init__(self, root: Path, told: Callable[[int], None] = lambda _count: None, *, suffix: str = "") -> None:
         """Write into `root`; `told` is called with the number of files after each of them.
 
-        `suffix` tells the unfinished files of this process from those of others that write into the same folder.
+        `suffix` distinguishes the unfinished files of this process from those of others that write into the folder.
         """
         self.root, self._told, self._suffix = root, told, suffix
         self._written: dict[str, ListedFile | None] = {}

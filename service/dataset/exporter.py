@@ -84,9 +84,9 @@ def write_data_set(
     fitting = dataset.of_first_camera if how.one_camera else dataset
     ready = undistorted_data_set(fitting, personal=personal) if how.pinhole else fitting
     identity = f"{how.name} 2 {ready.identity} {'with' if personal else 'without'} personal data"
-    told = _told(ready, how, progress)
-    with export_folder(target, identity, leaving, told) as folder:
-        write_views(ready, how, folder, told, processes)
+    report = _told(ready, how, progress)
+    with export_folder(target, identity, leaving, report) as folder:
+        write_views(ready, how, folder, report, processes)
         _write(ready, how, folder)
 
 
@@ -103,12 +103,12 @@ def _told(dataset: DataSet, how: Exporter, progress: Progress | None) -> Callabl
     total = count_files(lambda folder: _write(dataset, how, folder))
     most = 0
 
-    def told(count: int) -> None:
+    def report(count: int) -> None:
         nonlocal most
         most = max(most, count)  # the format's writer counts again what was written ahead of it
         progress("writing", most, total)
 
-    return told
+    return report
 
 
 _DESCRIBED = {

@@ -36,13 +36,13 @@ _BYTES_A_FACE = 300  # of the mesh, with its tree for rays
 class _ViewTask:
     """The task of making the files of one view: the file of the data set and the format, and the export's folder."""
 
-    kept: Path
+    data_file: Path
     root: Path
     view: str
 
 
 def write_views(
-    dataset: DataSet, how: Exporter, folder: ExportFolder, told: Callable[[int], None], processes: int | None = None
+    dataset: DataSet, how: Exporter, folder: ExportFolder, report: Callable[[int], None], processes: int | None = None
 ) -> None:
     """Write the files that belong to views, where that is worth it; nothing otherwise.
 
@@ -50,7 +50,7 @@ def write_views(
         dataset: the data set as the format gets it.
         how: the format.
         folder: the folder that is filled.
-        told: a function that is called with the number of files that are there.
+        report: a function that is called with the number of files that are there.
         processes: number of processes of this machine; None: as many as are worth it.
     """
     listed = ListedFiles()
@@ -68,14 +68,14 @@ def write_views(
         _log.info("the data set cannot be given to other processes, this one writes it: %s", error)
         return
     with tempfile.TemporaryDirectory(prefix="orthocapture-export-") as scratch:
-        kept = Path(scratch) / "data_set"
-        kept.write_bytes(data)
-        tasks = [_ViewTask(kept, folder.root, name) for name in missing]
+        data_file = Path(scratch) / "data_set"
+        data_file.write_bytes(data)
+        tasks = [_ViewTask(data_file, folder.root, name) for name in missing]
         done = sum(len(names) for name, names in files.items() if name not in missing)
         with mapping(processes, len(tasks)) as map_over:
             for count in map_over(_write_view, tasks):
                 done += count
-                told(done)
+                report(done)
         _read.cache_clear()
 
 
@@ -106,17 +106,17 @@ class _OneView(ExportFolder):
 
 def _write_view(task: _ViewTask) -> int:
     """Write the files of a view; returns their number."""
-    dataset, how = _read(task.kept)
+    dataset, how = _read(task.data_file)
     folder = _OneView(task.root, task.view)
     how.write(dataset, folder)
     return folder.count
 
 
 @lru_cache(maxsize=1)
-def _read(kept: Path) -> tuple[DataSet, Exporter]:
+def _read(data_file: Path) -> tuple[DataSet, Exporter]:
     """Return the data set and the format of a file, whose path never recurs.
 
     It is held, so that the mesh's tree for rays is built once.
     """
-    dataset, how = pickle.loads(kept.read_bytes())
+    dataset, how = pickle.loads(data_file.read_bytes())
     return dataset, how

@@ -50,22 +50,22 @@ def test_features_and_matches(cluster: Cluster, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["matching", "hdf5"])
-def test_exports(cluster: Cluster, tmp_path: Path, form: str) -> None:
+@pytest.mark.parametrize("export_format", ["matching", "hdf5"])
+def test_exports(cluster: Cluster, tmp_path: Path, export_format: str) -> None:
     """Undistorted pictures and depth, and all that other formats are made from; in one of two a worker is killed."""
     camera = CameraModel(320, 240, 380.0, 382.0, 156.0, 123.0, -0.12, 0.04, 8e-4, -5e-4)
     dataset = posed_data_set(tmp_path, 4, camera=camera)
 
-    def export(name: str, processes: int | None, told: Progress | None = None) -> dict[str, object]:
+    def export(name: str, processes: int | None, progress: Progress | None = None) -> dict[str, object]:
         out = tmp_path / name
-        write_data_set(dataset, exporter(form), out, processes=processes, progress=told)
+        write_data_set(dataset, exporter(export_format), out, processes=processes, progress=progress)
         files = {file.relative_to(out).as_posix(): file for file in out.rglob("*") if file.is_file()}
-        if form != "hdf5":
+        if export_format != "hdf5":
             return {name: file.read_bytes() for name, file in files.items()}
         return {name: arrays(file) for name, file in files.items() if file.suffix == ".h5"}
 
     def kill_a_worker(_what: str, _done: int, _total: int) -> None:
-        if form == "matching" and not killed:
+        if export_format == "matching" and not killed:
             killed.extend(psutil.Process(cluster.workers[0].pid).children()[:1])
             killed[0].kill()
 
@@ -76,7 +76,7 @@ def test_exports(cluster: Cluster, tmp_path: Path, form: str) -> None:
     with on(cluster), noting_places() as places:
         assert export("cluster", 2, kill_a_worker) == alone
     assert sum(places.values()) == 4
-    assert bool(killed) == (form == "matching")
+    assert bool(killed) == (export_format == "matching")
 
 
 def arrays(file: Path) -> dict[str, object]:

@@ -136,26 +136,26 @@ def _end_child(process: subprocess.Popen[bytes], pipe: Connection) -> None:
         process.wait()
 
 
-class _KeptProcesses(threading.local):
+class _ThreadProcesses(threading.local):
     """COLMAP's child process of each thread, by seed; it stays, because starting one takes as long as an image."""
 
     def __init__(self) -> None:
         self.by_seed: dict[int, ColmapProcess] = {}
 
 
-_KEPT = _KeptProcesses()
+_OF_THREAD = _ThreadProcesses()
 
 
-def kept_process(seed: int) -> ColmapProcess:
+def thread_process(seed: int) -> ColmapProcess:
     """Return the child process that this thread keeps from task to task."""
-    return _KEPT.by_seed.setdefault(seed, ColmapProcess(seed=seed))
+    return _OF_THREAD.by_seed.setdefault(seed, ColmapProcess(seed=seed))
 
 
-def end_kept_process(seed: int) -> None:
+def end_thread_process(seed: int) -> None:
     """End the child process that this thread keeps, if there is one."""
-    kept = _KEPT.by_seed.pop(seed, None)
-    if kept is not None:
-        kept.close()
+    process = _OF_THREAD.by_seed.pop(seed, None)
+    if process is not None:
+        process.close()
 
 
 _SPARE_BYTES = 1 << 30  # beyond what the library itself needs

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from service.compute.camera_model import CameraModel
-from service.compute.sfm.colmap_process import end_kept_process, kept_process
+from service.compute.sfm.colmap_process import end_thread_process, thread_process
 from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.compute.sfm.options import Progress, SfmOptions, reduction
 from service.core.errors import DataError
@@ -81,7 +81,7 @@ class FrontEnd:
 
     def close(self) -> None:
         """End COLMAP's child process of this thread."""
-        end_kept_process(self._options.seed)
+        end_thread_process(self._options.seed)
 
     def extract_features(self, file: Path) -> ImageFeatures:
         """Extract the features of one image.
@@ -168,13 +168,13 @@ def processes_worth(files: int, pairs: int, camera: CameraModel, options: SfmOpt
 
 def _extract(task: _Extraction) -> ImageFeatures:
     job = _job(task) | {"file": str(task.file)}
-    child = kept_process(task.options.seed)
+    child = thread_process(task.options.seed)
     return ImageFeatures(**child.run("extract", job, timeout_s=task.options.timeout_s))
 
 
 def _match(task: _Matching) -> list[PairMatches]:
     features = {name: ImageFeatures.from_bytes(file.read_bytes()) for name, file in task.files.items()}
-    child = kept_process(task.options.seed)
+    child = thread_process(task.options.seed)
     matches: list[PairMatches] = []
     for pair in task.pairs:
         a, b = (features[name] for name in pair)

@@ -60,7 +60,7 @@ def depth_maps(
     views: Sequence[StoredView],
     pairs: Sequence[Pair],
     centre_m: Array,
-    told: Callable[[int], None],
+    report: Callable[[int], None],
     *,
     guess: RayMesh | None = None,
     processes: int = 1,
@@ -71,7 +71,7 @@ def depth_maps(
         views: the views.
         pairs: pairs of them by index.
         centre_m: (3,) the place of the object.
-        told: a function that is called with the number of pairs matched.
+        report: a function that is called with the number of pairs matched.
         guess: the surface near which depth is searched; None: it is searched everywhere.
         processes: number of processes of this machine; 1: this one, unless a cluster was chosen.
     """
@@ -82,11 +82,11 @@ def depth_maps(
             near.write_bytes(pickle.dumps(guess, protocol=pickle.HIGHEST_PROTOCOL))
         tasks = [_PairTask(views[one], views[two], centre_m, near) for one, two in pairs]
         found: list[DepthMap] = []
-        told(0)
+        report(0)
         with mapping(processes, len(tasks)) as map_over:
             for done, depth in enumerate(map_over(_depth_map, tasks), 1):
                 found += [] if depth is None else [depth]
-                told(done)
+                report(done)
     _read_guess.cache_clear()
     return found
 

@@ -46,7 +46,8 @@ def reconstruct(views: Sequence[StereoView], progress: Progress, *, processes: i
     centre = looked_at_m(small)
     pairs = stereo_pairs(small)
     with stored_views(small) as stored:
-        coarse = depth_maps(stored, pairs, centre, _told(progress, "matching pairs", pairs), processes=processes)
+        report = _pair_progress(progress, "matching pairs", pairs)
+        coarse = depth_maps(stored, pairs, centre, report, processes=processes)
     if not coarse:
         raise ComputeError("no pair of images could be matched", remedy="Use more images, at smaller angles")
     many = len(coarse) >= _MANY
@@ -54,9 +55,9 @@ def reconstruct(views: Sequence[StereoView], progress: Progress, *, processes: i
     first = _surface(coarse, VOXEL_PX * _footprint_m(small, centre), _FEWEST_AT_FIRST if many else 1)
     guess = closed(first)
     near = RayMesh(guess.vertices_m, guess.faces)
-    told = _told(progress, "matching pairs near the first surface", pairs)
+    report = _pair_progress(progress, "matching pairs near the first surface", pairs)
     with stored_views(large) as stored:
-        fine = depth_maps(stored, pairs, centre, told, guess=near, processes=processes)
+        fine = depth_maps(stored, pairs, centre, report, guess=near, processes=processes)
     progress("fusing all depth maps", 0, 0)
     fused_all = _surface([*coarse, *fine], VOXEL_PX * _footprint_m(large, centre), _FEWEST if many else 1)
     if not many:
@@ -71,7 +72,7 @@ def _surface(maps: Sequence[DepthMap], voxel_m: float, least: int) -> Surface:
     return surface_of(fused(maps, voxel_m, least), least)
 
 
-def _told(progress: Progress, what: str, pairs: Sequence[Pair]) -> Callable[[int], None]:
+def _pair_progress(progress: Progress, what: str, pairs: Sequence[Pair]) -> Callable[[int], None]:
     return lambda done: progress(what, done, len(pairs))
 
 
