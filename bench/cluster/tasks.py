@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import distributed
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
@@ -207,30 +207,36 @@ def scaling(folder: Path, views: int, width: int, repeats: int) -> dict[str, dic
     """Return the wall time of a front end and of an export, by who computes: medians of turns."""
     files, camera, poses = draw(folder, views, width)
     data = data_set(files, camera, poses, mesh_of(20_000))
-    took: dict[str, dict[str, list[float]]] = {}
-    with ExitStack() as clusters:
-        places: dict[str, tuple[Scheduler | None, int]] = {
-            "this process": (None, 1),
-            "2 local processes": (None, 2),
-        }
-        for workers in (1, 2, 4):
-            own = folder / f"cluster{workers}"
-            own.mkdir()
-            cluster = clusters.enter_context(dask_cluster(own, workers=workers))
-            places[f"Dask, {workers} worker{'s' * (workers > 1)}"] = Scheduler(cluster.address, patience_s=90.0), 2
+    took: dict[str, dict[str, float]] = {}
+
+    def compute(name: str, scheduler: Scheduler | None, processes: int) -> None:
+        turns: list[tuple[float, float]] = []
         for turn in range(repeats):
-            for name, (scheduler, processes) in places.items():
-                out = folder / f"out{turn}{name}"
-                with computing_at(scheduler), tempfile.TemporaryDirectory() as scratch:
-                    with mapping(processes, 8) as map_over:
-                        list(map_over(square, range(8)))  # the connection is made
-                    begin = time.perf_counter()
-                    front_end(files, camera, poses, Path(scratch), processes)
-                    middle = time.perf_counter()
-                    write_data_set(data, exporter("nerfstudio"), out, processes=processes if processes > 1 else None)
-                    took.setdefault(name, {}).setdefault("front end", []).append(middle - begin)
-                    took[name].setdefault("export", []).append(time.perf_counter() - middle)
-    return {name: {what: round(statistics.median(s), 2) for what, s in each.items()} for name, each in took.items()}
+            out = folder / f"{name}, {turn}"
+            with computing_at(scheduler), tempfile.TemporaryDirectory() as scratch:
+                with mapping(processes, 8) as map_over:
+                    list(map_over(square, range(8)))  # the connection is made
+                begin = time.perf_counter()
+                front_end(files, camera, poses, Path(scratch), processes)
+                middle = time.perf_counter()
+                write_data_set(data, exporter("nerfstudio"), out, processes=processes if processes > 1 else None)
+                turns.append((middle - begin, time.perf_counter() - middle))
+        front_s, export_s = (round(statistics.median(each), 2) for each in zip(*turns, strict=True))
+        took[name] = {"front end": front_s, "export": export_s}
+
+    compute("this process", None, 1)
+    compute("2 local processes", None, 2)
+    own = folder / "cluster"
+    own.mkdir()
+    with dask_cluster(own, workers=0) as cluster:
+        for workers in (1, 2, 4):
+            while len(cluster.workers) < workers:
+                cluster.add_worker()
+            with distributed.Client(cluster.address, set_as_default=False) as client:
+                client.wait_for_workers(workers, timeout=300)
+            name = "Dask, 1 worker" if workers == 1 else f"Dask, {workers} workers"
+            compute(name, Scheduler(cluster.address, patience_s=90.0), 2)
+    return took
 
 
 def on_paper(sizes: list[TaskSize]) -> dict[str, list[dict[str, float]]]:
@@ -318,6 +324,7 @@ def main() -> None:
     load = f"{os.getloadavg()[1]:.1f}"
     with tempfile.TemporaryDirectory() as folder:
         sizes = task_sizes(Path(folder), args.faces)
+        print(json.dumps([asdict(size) for size in sizes], indent=1), flush=True)
         took = scaling(Path(folder), args.views, args.width, args.repeats)
     result = {
         "sizes": [asdict(size) for size in sizes],

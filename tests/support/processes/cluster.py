@@ -55,14 +55,22 @@ def dask_cluster(
     scheduler = _start([_SCHEDULER, *ports, *security], folder / "scheduler.log", {})
     cluster = Cluster("", folder, security, scheduler)
     try:
-        until(where.is_file, lambda: (folder / "scheduler.log").read_text(encoding="utf-8"))
-        cluster.address = json.loads(where.read_text(encoding="utf-8"))["address"]
+        until(lambda: bool(_address(where)), lambda: (folder / "scheduler.log").read_text(encoding="utf-8"))
+        cluster.address = _address(where)
         for _ in range(workers):
             cluster.add_worker()
         yield cluster
     finally:
         for process in [scheduler, *cluster.workers]:
             end_tree(process)
+
+
+def _address(where: Path) -> str:
+    """Return the address in a scheduler's file; "" while it is being written."""
+    try:
+        return str(json.loads(where.read_text(encoding="utf-8"))["address"])
+    except (FileNotFoundError, json.JSONDecodeError):
+        return ""
 
 
 def end_tree(process: subprocess.Popen[bytes]) -> None:
