@@ -11,7 +11,6 @@ import json
 import multiprocessing
 import os
 import pickle
-import resource
 import statistics
 import tempfile
 import time
@@ -26,6 +25,7 @@ from typing import Any
 import cv2
 import distributed
 import numpy as np
+import psutil
 
 from bench.machine import RESULTS, commit, machine
 from service.compute.camera_model import CameraModel
@@ -75,15 +75,22 @@ def measure(work: Callable[[], tuple[float, float]]) -> tuple[float, float, floa
 
 def _measure(work: Callable[[], tuple[float, float]]) -> tuple[float, float, float, float]:
     cv2.setNumThreads(1)
-    begin_s = _cpu_s()
+    begin_s, _ = _used()
     came, went = work()
-    peak = 1024 * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return _cpu_s() - begin_s, came, went, megabytes(peak)
+    cpu_s, peak_mb = _used()
+    return cpu_s - begin_s, came, went, peak_mb
 
 
-def _cpu_s() -> float:
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in used)
+def _used() -> tuple[float, float]:
+    """Return the CPU seconds, and the sum of the largest memories (MB), of this process and its children."""
+    own = psutil.Process()
+    cpu_s = peak_mb = 0.0
+    for process in [own, *own.children(recursive=True)]:
+        times = process.cpu_times()
+        cpu_s += times.user + times.system
+        status = Path(f"/proc/{process.pid}/status").read_text(encoding="utf-8")
+        peak_mb += megabytes(1024 * int(status.partition("VmHWM:")[2].split()[0]))
+    return cpu_s, peak_mb
 
 
 def draw(folder: Path, count: int, width: int) -> tuple[list[Path], CameraModel, list[Transform]]:
@@ -112,8 +119,7 @@ def full_size(file: Path, folder: Path, camera: CameraModel) -> tuple[Path, Came
 
 def extraction(file: Path, camera: CameraModel) -> tuple[float, float]:
     """Extract the features of an image; returns MB read and returned."""
-    with FrontEnd(camera, SfmOptions()) as front:
-        found = front.extract_features(file)
+    found = FrontEnd(camera, SfmOptions()).extract_features(file)  # its child lives on, and is measured too
     return megabytes(file.stat().st_size), megabytes(len(pickle.dumps(found)))
 
 
@@ -121,8 +127,7 @@ def matching(files: list[Path], camera: CameraModel) -> tuple[float, float]:
     """Match the pairs of one task of features in files; returns MB read and returned."""
     names = {str(k): file for k, file in enumerate(files)}
     pairs = [("0", str(k)) for k in range(1, PAIRS_A_TASK + 1)]
-    with FrontEnd(camera, SfmOptions()) as front:
-        found = front.match_pairs(names, pairs)
+    found = FrontEnd(camera, SfmOptions()).match_pairs(names, pairs)
     return megabytes(sum(file.stat().st_size for file in files)), megabytes(len(pickle.dumps(found)))
 
 
@@ -144,11 +149,11 @@ def mesh_of(faces: int) -> Surface:
 
 
 def depth(camera: CameraModel, pose: Transform, faces: int) -> tuple[float, float]:
-    """Compute a depth map of 60 megapixels and code it as PNG; returns MB of the mesh, and of the file."""
+    """Compute a depth map of 60 megapixels and code it as PNG; returns MB read and written."""
     surface = mesh_of(faces)
     data = data_set([], camera, [pose], surface)
-    coded = png(coded_depth(data.pixels.depth_m(data.views[0])))
-    return megabytes(surface.vertices_m.nbytes + surface.faces.nbytes), megabytes(len(coded))
+    sent_mb = megabytes(len(pickle.dumps(data)))
+    return sent_mb, megabytes(len(png(coded_depth(data.pixels.depth_m(data.views[0])))))
 
 
 def undistortion(file: Path, camera: CameraModel, pose: Transform) -> tuple[float, float]:
