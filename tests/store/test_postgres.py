@@ -457,6 +457,7 @@ with Store.open(Path(sys.argv[1])) as store:
 """
 
 
+@pytest.mark.slow
 def test_workers_whose_clocks_differ_by_ten_minutes_take_no_job_early(cluster: Cluster, tmp_path: Path) -> None:
     database = cluster.new_database()
     site = cluster.site(tmp_path / "site", database)
@@ -485,6 +486,7 @@ def test_workers_whose_clocks_differ_by_ten_minutes_take_no_job_early(cluster: C
             holder.stdin.close()
 
 
+@pytest.mark.slow
 def test_a_worker_takes_the_kinds_that_it_is_given(site: Path, tmp_path: Path) -> None:
     camera = camera_of_width(160)
     picture = tmp_path / "view.png"
