@@ -21,9 +21,19 @@ from service.cli.common import (
     require_writable_folder,
 )
 from service.cli.options import OperatorOption, PasswordOption, acting_person
+from service.cli.scheduler import (
+    PATIENCE_S,
+    SchedulerCaOption,
+    SchedulerCertOption,
+    SchedulerKeyOption,
+    SchedulerOption,
+    SchedulerPatienceOption,
+    reached_scheduler,
+)
 from service.core.errors import ConfigurationError
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.text.words import counted
+from service.machine.executors import computing_at
 from service.store.store import Store
 
 
@@ -84,6 +94,11 @@ def export_command(
     data_version: Annotated[str, typer.Option(help="Version of the data set.")] = FIRST_VERSION,
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
+    scheduler: SchedulerOption = "",
+    scheduler_ca: SchedulerCaOption = None,
+    scheduler_cert: SchedulerCertOption = None,
+    scheduler_key: SchedulerKeyOption = None,
+    scheduler_patience: SchedulerPatienceOption = PATIENCE_S,
     json: JsonOption = False,
 ) -> None:
     """Write the data set of a completed run in a format that others read: images, poses, depth, masks, mesh.
@@ -111,7 +126,10 @@ def export_command(
         )
         wanted = WantedExport(form, crop, crops, anonymous, stated, data_version)
         who = acting_person(store, operator, password_stdin=password_stdin)
-        with progress_bar(quiet=json) as progress:
+        cluster = reached_scheduler(
+            scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
+        )
+        with progress_bar(quiet=json) as progress, computing_at(cluster):
             dataset = export_data_set(store, run_id, wanted, target, who.name, progress)
     if json:
         print_json(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.core.errors import ConfigurationError
+from service.machine.executors import VARIABLE
 
 if TYPE_CHECKING:
     from service.machine.schedulers import Scheduler
@@ -18,20 +19,26 @@ SchedulerOption = Annotated[
     str,
     typer.Option(
         "--scheduler",
-        envvar="ORTHOCAPTURE_SCHEDULER",
+        envvar=VARIABLE,
         help="tcp://host:port or tls://host:port of a Dask scheduler, whose workers compute what is parallel "
         "inside a job; default: processes of this machine.",
     ),
 ]
 SchedulerCaOption = Annotated[
     Path | None,
-    typer.Option("--scheduler-ca", help="For tls: the certificate of the authority that signed the others."),
+    typer.Option(
+        "--scheduler-ca",
+        envvar=f"{VARIABLE}_CA",
+        help="For tls: the certificate of the authority that signed the others.",
+    ),
 ]
 SchedulerCertOption = Annotated[
-    Path | None, typer.Option("--scheduler-cert", help="For tls: the certificate of this machine.")
+    Path | None,
+    typer.Option("--scheduler-cert", envvar=f"{VARIABLE}_CERT", help="For tls: the certificate of this machine."),
 ]
 SchedulerKeyOption = Annotated[
-    Path | None, typer.Option("--scheduler-key", help="For tls: the key of this machine's certificate.")
+    Path | None,
+    typer.Option("--scheduler-key", envvar=f"{VARIABLE}_KEY", help="For tls: the key of this machine's certificate."),
 ]
 SchedulerPatienceOption = Annotated[
     float,

@@ -28,6 +28,15 @@ from service.cli.common import (
     tell_left_out,
     write_whole,
 )
+from service.cli.scheduler import (
+    PATIENCE_S,
+    SchedulerCaOption,
+    SchedulerCertOption,
+    SchedulerKeyOption,
+    SchedulerOption,
+    SchedulerPatienceOption,
+    reached_scheduler,
+)
 from service.compute.camera_model import CameraCovariance, read_camera_covariance
 from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.images.photographs import image_folder
@@ -42,6 +51,7 @@ from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
 from service.core.units import deg, metres, mm
+from service.machine.executors import computing_at
 
 _FAR = 0.1  # fraction of the cameras' spread; robot poses that are off by more are in another frame
 
@@ -90,6 +100,11 @@ def sfm_command(
         Path | None, typer.Option("--workspace", help="Folder to keep features and matches for another mapper.")
     ] = None,
     strict: StrictOption = False,
+    scheduler: SchedulerOption = "",
+    scheduler_ca: SchedulerCaOption = None,
+    scheduler_cert: SchedulerCertOption = None,
+    scheduler_key: SchedulerKeyOption = None,
+    scheduler_patience: SchedulerPatienceOption = PATIENCE_S,
     json: JsonOption = False,
 ) -> None:
     """Estimate camera poses with fixed, calibrated intrinsics; use the model with register --estimate-scale."""
@@ -111,7 +126,10 @@ def sfm_command(
         station = None if stations is None else read_stations(stations, files)
         options = options_for(effort, model, refine=refine, threads=os.cpu_count() or 1)
         known = _spheres(mesh, spheres, radius_mm, mesh_unit) if hybrid else None
-        with _workspace(workspace) as folder, progress_bar(quiet=json) as progress:
+        cluster = reached_scheduler(
+            scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
+        )
+        with _workspace(workspace) as folder, progress_bar(quiet=json) as progress, computing_at(cluster):
             work = SfmWorkspace(folder, model, options, progress)
             solved, off_m = _reconstruct(files, work, mapper, prior, station)
             well_known = read_camera_covariance(camera) if refine == "nothing" else None

@@ -26,6 +26,8 @@ from service.cli.scheduler import (
     SchedulerPatienceOption,
     reached_scheduler,
 )
+from service.computations import job_kinds
+from service.core.errors import ConfigurationError
 from service.core.text.words import counted
 from service.logs.file_log import file_log
 from service.store.access import kept_to
@@ -39,6 +41,12 @@ def worker_command(
     jobs: Annotated[
         int, typer.Option("--jobs", min=0, help="Number of jobs to compute at once; 0: one per core.")
     ] = 0,
+    kinds: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND[,KIND…]", help="Compute only jobs of these kinds, such as features,match; default: all."
+        ),
+    ] = "",
     scheduler: SchedulerOption = "",
     scheduler_ca: SchedulerCaOption = None,
     scheduler_cert: SchedulerCertOption = None,
@@ -64,6 +72,7 @@ def worker_command(
         uploading(data),
         progress_bar(quiet=json) as progress,
     ):
+        chosen = _kinds(kinds)
         cluster = reached_scheduler(
             scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
         )
@@ -74,8 +83,24 @@ def worker_command(
             stop=lambda: stopped or (parent != 0 and os.getppid() != parent),
             progress=progress,
             scheduler=cluster,
+            kinds=chosen,
         )
         if json:
             print_json({"jobs": done})
         elif not parent:
             console.print(f"{counted(done, 'job')} done")
+
+
+def _kinds(text: str) -> tuple[str, ...] | None:
+    """Return the kinds of the option; None without it. Raises ConfigurationError if one does not exist."""
+    if not text:
+        return None
+    kinds = tuple(name.strip() for name in text.split(","))
+    unknown = sorted(set(kinds) - set(job_kinds()))
+    if unknown:
+        raise ConfigurationError(
+            f"there is no kind of job called {unknown[0]!r}",
+            where="--kinds",
+            remedy=f"Choose among {', '.join(job_kinds())}",
+        )
+    return kinds

@@ -78,9 +78,12 @@ def json_bytes(document: object) -> bytes:
 class ExportFolder:
     """The folder into which a format's writer puts its files."""
 
-    def __init__(self, root: Path, told: Callable[[int], None] = lambda _count: None) -> None:
-        """Write into `root`; `told` is called with the number of files after each of them."""
-        self._root, self._told = root, told
+    def __init__(self, root: Path, told: Callable[[int], None] = lambda _count: None, *, suffix: str = "") -> None:
+        """Write into `root`; `told` is called with the number of files after each of them.
+
+        `suffix` distinguishes the unfinished files of this process from those of others that write into the folder.
+        """
+        self.root, self._told, self._suffix = root, told, suffix
         self._written: dict[str, ListedFile | None] = {}
         self.parts: dict[str, dict[str, str]] = {}  # what belongs to views: role → view → file
 
@@ -90,7 +93,7 @@ class ExportFolder:
 
     def anew(self, name: str, make: Callable[[], bytes]) -> None:
         """Write a file, also if an interrupted export wrote it."""
-        (self._root / name).unlink(missing_ok=True)
+        (self.root / name).unlink(missing_ok=True)
         self.file(name, make)
 
     def text(self, name: str, text: str) -> None:
@@ -112,17 +115,21 @@ class ExportFolder:
         Raises:
             ConfigurationError: the name was given already, or leads out of the folder.
         """
-        path = self._root / name
-        if name in self._written or not path.resolve().is_relative_to(self._root.resolve()):
+        path = self.root / name
+        if name in self._written or not path.resolve().is_relative_to(self.root.resolve()):
             raise ConfigurationError("an exporter writes this file twice, or outside its folder", where=name)
         self._named(name, part)
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
-            beside = path.with_name(f".{path.name}{_PART}")
+            beside = path.with_name(f".{path.name}{self._suffix}{_PART}")
             write(beside)
             _DISK.sync_file(beside)
             beside.replace(path)
         self._told(len(self._written))
+
+    def has(self, name: str) -> bool:
+        """Return whether a file is there and complete."""
+        return (self.root / name).is_file()
 
     def _named(self, name: str, part: Part | None) -> None:
         self._written[name] = None
@@ -133,7 +140,7 @@ class ExportFolder:
         """Return the files that were written up to now, in order of their names; each is hashed once."""
         found: list[ListedFile] = []
         for name, known in sorted(self._written.items()):
-            path = self._root / name
+            path = self.root / name
             if known is None and not path.is_file():
                 continue  # the one that is being made
             found.append(known or ListedFile(name, *hash_file(path)))
@@ -142,25 +149,32 @@ class ExportFolder:
 
     def close(self) -> None:
         """Remove what does not belong here, and write the checksums of everything that does."""
-        for path in self._root.rglob("*"):
-            if path.is_file() and path.relative_to(self._root).as_posix() not in self._written:
+        for path in self.root.rglob("*"):
+            if path.is_file() and path.relative_to(self.root).as_posix() not in self._written:
                 path.unlink()
         lines = [f"{file.sha256}  {file.path}\n" for file in self.listed()]
-        sums = self._root / f".{SUMS}{_PART}"
+        sums = self.root / f".{SUMS}{_PART}"
         sums.write_bytes("".join(lines).encode())
         _DISK.sync_file(sums)
-        sums.replace(self._root / SUMS)
-        for folder in (self._root, *(path for path in self._root.rglob("*") if path.is_dir())):
+        sums.replace(self.root / SUMS)
+        for folder in (self.root, *(path for path in self.root.rglob("*") if path.is_dir())):
             _DISK.sync_directory(folder)
 
 
-class _Listed(ExportFolder):
-    """Counts what a writer would write, and writes nothing."""
+class ListedFiles(ExportFolder):
+    """Lists what a writer would write, and writes nothing."""
+
+    def __init__(self) -> None:
+        """List no file yet."""
+        super().__init__(Path())
+        self.of_views: dict[str, list[str]] = {}  # view → its files
 
     def written_by(self, name: str, write: Callable[[Path], object], part: Part | None = None) -> None:
         """Remember the name, and write nothing."""
         del write
         self._named(name, part)
+        if part is not None:
+            self.of_views.setdefault(part.view, []).append(name)
 
     def anew(self, name: str, make: Callable[[], bytes]) -> None:
         """Remember the name, and write nothing."""
@@ -174,7 +188,7 @@ class _Listed(ExportFolder):
 
 def count_files(write: Callable[[ExportFolder], object]) -> int:
     """Return the number of files that a writer makes; none is made."""
-    listed = _Listed(Path())
+    listed = ListedFiles()
     write(listed)
     return listed.count
 

@@ -13,6 +13,7 @@ from service.dataset.croissant import VIEWS_NAME, views_csv
 from service.dataset.export_folder import ExportFolder, count_files, export_folder, json_bytes
 from service.dataset.pixels import undistorted_data_set
 from service.dataset.records import DataSet
+from service.dataset.writing_views import write_views
 
 GROUP = "orthocapture.exporters"
 Progress = Callable[[str, int, int], None]  # activity, files done, files in total
@@ -63,6 +64,7 @@ def write_data_set(
     personal: bool = True,
     leaving: Callable[[Path], None] = lambda _sums: None,
     progress: Progress | None = None,
+    processes: int | None = None,
 ) -> None:
     """Write a data set into a new folder, with what every folder has beside the format.
 
@@ -73,6 +75,7 @@ def write_data_set(
         personal: False leaves GPS, owner and serial numbers out of resampled pictures.
         leaving: a function called with the list of checksums when all is written, before the folder has its name.
         progress: a function that is called with the activity, the files done and their total.
+        processes: number of processes of this machine that write the views' files; None: as many as are worth it.
 
     Raises:
         DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.
@@ -81,7 +84,9 @@ def write_data_set(
     fitting = dataset.of_first_camera if how.one_camera else dataset
     ready = undistorted_data_set(fitting, personal=personal) if how.pinhole else fitting
     identity = f"{how.name} 2 {ready.identity} {'with' if personal else 'without'} personal data"
-    with export_folder(target, identity, leaving, _told(ready, how, progress)) as folder:
+    report = _told(ready, how, progress)
+    with export_folder(target, identity, leaving, report) as folder:
+        write_views(ready, how, folder, report, processes)
         _write(ready, how, folder)
 
 
@@ -96,7 +101,14 @@ def _told(dataset: DataSet, how: Exporter, progress: Progress | None) -> Callabl
     if progress is None:
         return lambda _count: None
     total = count_files(lambda folder: _write(dataset, how, folder))
-    return lambda count: progress("writing", count, total)
+    most = 0
+
+    def report(count: int) -> None:
+        nonlocal most
+        most = max(most, count)  # the format's writer counts again what was written ahead of it
+        progress("writing", most, total)
+
+    return report
 
 
 _DESCRIBED = {

@@ -31,6 +31,10 @@ class _Last(Generic[_T]):
         self._make = make
         self._kept: tuple[str, _T] | None = None
 
+    def __getstate__(self) -> dict[str, object]:
+        """Return what travels to another process: not what was made."""
+        return {"_make": self._make, "_kept": None}
+
     def of(self, view: PosedView) -> _T:
         """Return what was made for a view; it must not be written to."""
         if self._kept is None or self._kept[0] != view.name:
@@ -64,7 +68,7 @@ class Photographs:
         """
         self._files, self._surface, self._spheres, self._posts = files, surface, spheres, posts
         self._personal, self._mark = personal, mark
-        self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
+        self._colours = _Last(self._read)
 
     def picture(self, view: PosedView) -> bytes:
         """Return the file as the camera wrote it, except what was to be removed or marked."""
@@ -81,6 +85,9 @@ class Photographs:
     def colours(self, view: PosedView) -> NDArray[np.uint8]:
         """Return the colours (H, W, 3), BGR."""
         return self._colours.of(view)
+
+    def _read(self, view: PosedView) -> NDArray[np.uint8]:
+        return read_image_of(self._files[view.name], view.camera)
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """Return the depth (H, W), z of the mesh."""

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import importlib
 import multiprocessing
+import os
 import socket
+import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
+from multiprocessing.connection import wait
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 from service.logs.terminal import show_own_words_only
@@ -23,6 +27,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _P = ParamSpec("_P")
 
+VARIABLE = "ORTHOCAPTURE_SCHEDULER"  # the environment variable with the address of a scheduler
 IN_THIS_PROCESS = 0  # a number of processes: the work is not worth others, whichever executor was chosen
 
 
@@ -88,8 +93,17 @@ def local_pool(processes: int) -> ProcessPoolExecutor:
 
 
 def _one_thread() -> None:
+    threading.Thread(target=_end_with_parent, name="parent-watch", daemon=True).start()
     show_own_words_only()
     importlib.import_module("cv2").setNumThreads(1)
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as its parent has died: it would wait for ever for the next task."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 _chosen: ContextVar[Executors] = ContextVar("_chosen", default=LocalProcesses())  # noqa: B039 - it has no state
@@ -119,6 +133,25 @@ def computing_at(scheduler: Scheduler | None) -> Generator[None]:
             yield
     finally:
         executors.close()
+
+
+@contextmanager
+def computing_as_environment_says() -> Generator[None]:
+    """Choose the executors of the scheduler that the environment names, for a program without options for it.
+
+    Raises ConfigurationError: what it says is no scheduler.
+    """
+    address = os.environ.get(VARIABLE, "")
+    if not address:
+        yield
+        return
+    from service.machine.schedulers import Scheduler  # noqa: PLC0415 - few programs have a cluster
+
+    ca, cert, key = (
+        Path(file) if (file := os.environ.get(f"{VARIABLE}_{name}")) else None for name in ("CA", "CERT", "KEY")
+    )
+    with computing_at(Scheduler(address, ca, cert, key)):
+        yield
 
 
 @contextmanager

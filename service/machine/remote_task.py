@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import importlib
+import io
 import pickle
 import platform
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +24,20 @@ from service.core.units import megabytes
 from service.machine.executors import Place, this_place
 from service.machine.resources import keep_freed_memory
 
-_DECIDES = ("compute", "core", "machine")  # the rooms of the service whose source decides a task's result
+_DECIDES = ("compute", "core", "dataset", "machine")  # the rooms of the service whose source decides a task's result
 _LARGEST_BYTES = 1_000_000  # of a task's arguments: larger ones belong into a file
 
 
 @dataclass(frozen=True, slots=True)
 class NeededFile:
-    """A file that a task reads, with its size as the job sees it; -1 for a folder that it writes into."""
+    """A file that a task reads, with its size as the job sees it; -1 for a folder that it writes into.
+
+    `sha256` is the hash of its content where its name says that, as of all artefacts; "" otherwise.
+    """
 
     path: str
     size_bytes: int
+    sha256: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +63,16 @@ def remote_task(call: Callable[[], Any]) -> RemoteTask:
     Raises ConfigurationError if it holds arrays that are too large to travel, and TypeError or AttributeError if it
     cannot be pickled.
     """
-    data = pickle.dumps(call, protocol=pickle.HIGHEST_PROTOCOL)
+    written = io.BytesIO()
+    pickler = _CallPickler(written, protocol=pickle.HIGHEST_PROTOCOL)
+    pickler.dump(call)
+    data = written.getvalue()
     if len(data) > _LARGEST_BYTES:
         raise ConfigurationError(
             f"the arguments of one task have {megabytes(len(data)):.1f} MB",
             remedy="Pass the path of a file",
         )
-    files = {path: _needed(path) for path in _paths_in(call)}
-    return RemoteTask(data, tuple(files.values()), tuple(versions_here().items()))
+    return RemoteTask(data, tuple(_needed(path) for path in pickler.paths), tuple(versions_here().items()))
 
 
 def compute_there(task: RemoteTask) -> RemoteResult:
@@ -79,11 +86,10 @@ def compute_there(task: RemoteTask) -> RemoteResult:
     differing = different_versions(dict(task.versions), versions_here())
     if differing:
         raise version_error(place.host, differing)
-    for needed in task.files:
-        _require(needed, place.host)
+    here = {needed.path: _path_here(needed, place.host) for needed in task.files}
     _prepare_process()
     importlib.import_module("cv2").setNumThreads(1)  # as in the processes of the job's own machine
-    call: Callable[[], Any] = pickle.loads(task.call)
+    call: Callable[[], Any] = _CallUnpickler(io.BytesIO(task.call), here).load()
     return RemoteResult(call(), place)
 
 
@@ -148,36 +154,63 @@ def _sources(folder: Traversable, name: str) -> Iterator[tuple[str, Traversable]
             yield f"{name}/{entry.name}", entry
 
 
-def _paths_in(value: object) -> Iterator[Path]:
-    """Yield the paths in the arguments of a call."""
-    if isinstance(value, Path):
-        yield value
-    elif isinstance(value, partial):
-        called = cast("partial[Any]", value)
-        yield from _paths_in([called.func, *called.args, *called.keywords.values()])
-    elif isinstance(value, (list, tuple)):
-        for part in cast("list[object]", value):
-            yield from _paths_in(part)
-    elif isinstance(value, dict):
-        yield from _paths_in(list(cast("dict[object, object]", value).values()))
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        for field in dataclasses.fields(value):
-            yield from _paths_in(getattr(value, field.name))
+_ARTEFACT = re.compile(r"([0-9a-f]{2})/\1[0-9a-f]{62}")  # the end of a path: the name of a file is its hash
+_fetch: Callable[[str], Path] | None = None
+
+
+def fetch_artefacts_with(fetch: Callable[[str], Path]) -> None:
+    """Let this process take artefacts by their SHA-256 where it does not see the files that tasks name.
+
+    Args:
+        fetch: returns the file of an artefact, from an object store for example. Raises OrthocaptureError.
+    """
+    global _fetch  # noqa: PLW0603 - a property of the process, set once while it starts
+    _fetch = fetch
+
+
+class _CallPickler(pickle.Pickler):
+    """Pickles a call, and collects the paths in it."""
+
+    def __init__(self, file: io.BytesIO, *, protocol: int) -> None:
+        super().__init__(file, protocol=protocol)
+        self.paths: dict[Path, None] = {}
+
+    def persistent_id(self, obj: object) -> str | None:
+        """Return a path as text, which is read as the path that the other machine has for it; None for others."""
+        if not isinstance(obj, Path):
+            return None
+        path = obj.absolute()
+        self.paths[path] = None
+        return str(path)
+
+
+class _CallUnpickler(pickle.Unpickler):
+    """Unpickles a call with the paths of this machine."""
+
+    def __init__(self, file: io.BytesIO, here: Mapping[str, Path]) -> None:
+        super().__init__(file)
+        self._here = here
+
+    def persistent_load(self, pid: str) -> Path:
+        """Return the path for what `persistent_id` gave."""
+        return self._here.get(pid, Path(pid))
 
 
 def _needed(path: Path) -> NeededFile:
-    path = path.absolute()
     if path.is_file():
-        return NeededFile(str(path), path.stat().st_size)
+        sha256 = path.name if _ARTEFACT.fullmatch("/".join(path.parts[-2:])) else ""
+        return NeededFile(str(path), path.stat().st_size, sha256)
     return NeededFile(str(path if path.is_dir() else path.parent), -1)
 
 
-def _require(needed: NeededFile, host: str) -> None:
-    """Raise DataError if this machine does not see what a task needs."""
+def _path_here(needed: NeededFile, host: str) -> Path:
+    """Return the path at which this machine has what a task needs. Raises DataError if it does not see it."""
     path = Path(needed.path)
     if needed.size_bytes < 0:
         problem = "" if path.is_dir() else "does not see the folder"
     elif not path.is_file():
+        if needed.sha256 and _fetch is not None:
+            return _fetch(needed.sha256)
         problem = "does not see the file"
     else:
         problem = "" if path.stat().st_size == needed.size_bytes else "sees another file under the path"
@@ -186,5 +219,7 @@ def _require(needed: NeededFile, host: str) -> None:
             f"the machine {host} of the cluster {problem} {path}",
             where=f"{host}:{path}",
             remedy="Tasks carry paths: mount the data folder and the folder for temporary files (TMPDIR) under the "
-            "same path on every machine of the cluster, or compute without --scheduler",
+            "same path on every machine of the cluster; let its workers fetch artefacts from the site's object "
+            "store; or compute without --scheduler (docs/howto/cluster.md)",
         )
+    return path

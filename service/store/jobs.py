@@ -83,11 +83,15 @@ def read_jobs(connection: Connection, run_id: str) -> list[Job]:
     ]
 
 
-def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> int:
-    """Return the number of jobs queued or being computed, of one run or of all, in one lane or in both."""
+def open_jobs(
+    connection: Connection, run_id: str | None, lane: Lane | None, kinds: Collection[str] | None = None
+) -> int:
+    """Return the number of jobs queued or being computed, of one run or all, in one lane or both, of some kinds."""
     statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
     if run_id is not None:
         statement = statement.where(jobs.c.run_id == run_id)
+    if kinds is not None:
+        statement = statement.where(jobs.c.kind.in_(tuple(kinds)))
     return connection.execute(statement).scalar_one()
 
 

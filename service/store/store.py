@@ -349,13 +349,16 @@ class Store:
         with self._database.reading() as connection:
             return queue.started(connection, self.clock, run_id)
 
-    def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
+    def open_jobs(
+        self, run_id: str | None = None, *, lane: Lane | None = None, kinds: Collection[str] | None = None
+    ) -> int:
         """Return the number of jobs of a run, or of all runs, that are queued or being computed.
 
-        `lane` counts only jobs that a person or a step waits for ("waited"), or only the others ("background").
+        `lane` counts only jobs that a person or a step waits for ("waited"), or only the others ("background");
+        `kinds` only those of these kinds.
         """
         with self._database.reading() as connection:
-            return queue.open_jobs(connection, run_id, lane)
+            return queue.open_jobs(connection, run_id, lane, kinds)
 
     def claim_job(
         self,

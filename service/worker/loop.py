@@ -48,6 +48,7 @@ def work(
     stop: Callable[[], bool],
     progress: Callable[[str, int, int], None],
     lane: Lane | None = None,
+    kinds: tuple[str, ...] | None = None,
     finished: Callable[[], None] = lambda: None,
     end: Callable[[], None] = lambda: None,
 ) -> int:
@@ -59,6 +60,7 @@ def work(
         stop: called between jobs.
         progress: called with what a job does, how much is done, and the total.
         lane: the lane of jobs to compute: those that a step waits for, or the others; None: all.
+        kinds: the kinds of jobs to compute; None: all.
         finished: called after each job.
         end: called from another thread when the job that is computed has been cancelled, or has taken too long; ends
             the process if the computation is to end with it.
@@ -75,7 +77,7 @@ def work(
         if waiting:
             store.clock.sleep(_POLL_S)
             continue
-        job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS), lane=lane)
+        job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS if kinds is None else kinds), lane=lane)
         if job is None:
             if until_idle:
                 return done

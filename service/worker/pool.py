@@ -56,9 +56,16 @@ class _Child:
 class Pool:
     """The children of one worker, as a context manager: at its end they are stopped and their jobs queued again."""
 
-    def __init__(self, store: Store, data: Path, at_once: int, scheduler: Scheduler | None = None) -> None:
+    def __init__(
+        self,
+        store: Store,
+        data: Path,
+        at_once: int,
+        scheduler: Scheduler | None = None,
+        kinds: tuple[str, ...] | None = None,
+    ) -> None:
         self.done = 0
-        self._scheduler = scheduler
+        self._scheduler, self._kinds = scheduler, kinds
         self._store, self._data = store, data
         self._scratch = tempfile.TemporaryDirectory(prefix="orthocapture-worker-", ignore_cleanup_errors=True)
         self._context = multiprocessing.get_context("spawn")
@@ -92,7 +99,7 @@ class Pool:
                 self._children[index] = self._start(child.lane)
         for lane, most in self._most.items():
             there = sum(child.lane == lane for child in self._children)
-            if there < min(most, self._store.open_jobs(lane=lane)):
+            if there < min(most, self._store.open_jobs(lane=lane, kinds=self._kinds)):
                 self._children.append(self._start(lane))
         if not by_pipe:
             self._store.clock.sleep(timeout_s)
@@ -120,7 +127,7 @@ class Pool:
     def _start(self, lane: Lane) -> _Child:
         ours, theirs = self._context.Pipe(duplex=False)
         scratch = Path(tempfile.mkdtemp(dir=self._scratch.name))
-        arguments = (self._data, lane, scratch, theirs, os.getpid(), self._scheduler)
+        arguments = (self._data, lane, scratch, theirs, os.getpid(), self._scheduler, self._kinds)
         process = self._context.Process(target=_serve, args=arguments, name=f"orthocapture-{lane}")
         process.start()
         theirs.close()
@@ -149,6 +156,7 @@ def work_side_by_side(
     stop: Callable[[], bool],
     progress: Progress,
     scheduler: Scheduler | None = None,
+    kinds: tuple[str, ...] | None = None,
 ) -> int:
     """Compute the jobs of a data folder in parallel until `stop()`.
 
@@ -159,18 +167,22 @@ def work_side_by_side(
         stop: called several times a second.
         progress: called with what a job does, how much is done, and the total.
         scheduler: that of the cluster which computes what is parallel inside a job; None: this machine does.
+        kinds: the kinds of jobs to compute; None: all.
 
     Returns:
         the number of jobs computed.
     """
     with Store.open(data) as store:
-        if until_idle and not store.open_jobs():
+        if until_idle and not store.open_jobs(kinds=kinds):
             return 0
-        with Pool(store, data, at_once, scheduler) as pool, contextlib.closing(SignOfLife(data, store.clock)) as sign:
+        with (
+            Pool(store, data, at_once, scheduler, kinds) as pool,
+            contextlib.closing(SignOfLife(data, store.clock)) as sign,
+        ):
             while not stop():
                 pool.tend(progress)
                 sign.give(pool.done)
-                if until_idle and not store.open_jobs():
+                if until_idle and not store.open_jobs(kinds=kinds):
                     while pool.tend(progress) or pool.busy:  # a job's end is recorded before its child reports it
                         pass
                     break
@@ -180,7 +192,15 @@ def work_side_by_side(
 # --- in a child ---------------------------------------------------------------------------------------------------
 
 
-def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int, scheduler: Scheduler | None) -> None:
+def _serve(
+    data: Path,
+    lane: Lane,
+    scratch: Path,
+    pipe: Connection,
+    parent: int,
+    scheduler: Scheduler | None,
+    kinds: tuple[str, ...] | None,
+) -> None:
     """Run a child: its entry point."""
     show_own_words_only()
     os.setsid()  # Ctrl-C must reach only the worker, which ends its children and their processes
@@ -205,6 +225,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int,
             stop=lambda: False,
             progress=tell,
             lane=lane,
+            kinds=kinds,
             finished=lambda: tell("", 0, -1),
             end=end,
         )

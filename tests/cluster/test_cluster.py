@@ -9,11 +9,10 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import cv2
 import numpy as np
@@ -33,7 +32,7 @@ from service.store.store import Store
 from tests.support.boards.board_folder import board_folder
 from tests.support.pages.certificates import self_signed
 from tests.support.processes import cluster_tasks as tasks
-from tests.support.processes.cluster import Cluster, dask_cluster, end_tree
+from tests.support.processes.cluster import Cluster, bits, dask_cluster, end_tree, on
 from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue, start_run
 from tests.support.rig.rig import REPOSITORY, command
@@ -47,34 +46,6 @@ from service.cli.main import main
 sys.argv = ["orthocapture", *sys.argv[1:]]
 main()
 """
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Generator[Cluster]:
-    with dask_cluster(tmp_path_factory.mktemp("cluster")) as started:
-        yield started
-
-
-@contextmanager
-def on(cluster: Cluster, patience_s: float = 60.0) -> Generator[None]:
-    """Compute on a cluster that has answered."""
-    with computing_at(Scheduler(cluster.address, patience_s=patience_s)):
-        yield
-
-
-def bits(value: object) -> object:
-    """Every number of a result as its bits."""
-    if isinstance(value, np.ndarray):
-        return (value.dtype.str, value.shape, value.tobytes())
-    if isinstance(value, float):
-        return value.hex()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return [type(value).__name__, *(bits(getattr(value, field.name)) for field in dataclasses.fields(value))]
-    if isinstance(value, Mapping):
-        return [(bits(k), bits(v)) for k, v in cast("Mapping[object, object]", value).items()]
-    if isinstance(value, (list, tuple)):
-        return [bits(part) for part in cast("Sequence[object]", value)]
-    return repr(value)
 
 
 @pytest.mark.slow

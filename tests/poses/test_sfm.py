@@ -115,11 +115,12 @@ def test_pieces_in_any_order_make_the_same_model(
     planned = pairs_of(views, prior, OPTIONS)
     models: list[SfmModel] = []
     for turn, order in enumerate((sorted(views), sorted(views, reverse=True))):
-        features: dict[str, ImageFeatures] = {}
+        features: dict[str, Path] = {}
         packed: list[bytes] = []
         with FrontEnd(camera, OPTIONS, processes=1 + turn) as front:
             for name in order:
-                features[name] = ImageFeatures.from_bytes(front.extract_features(views[name][0]).to_bytes())
+                features[name] = tmp_path / f"{turn}-{len(features)}.npz"
+                features[name].write_bytes(front.extract_features(views[name][0]).to_bytes())
                 begun = [pair for pair in planned[: 5 * turn + 8] if name in pair and features.keys() >= set(pair)]
                 found = front.match_pairs(features, begun)
                 packed.append(pack_matches(found))
@@ -127,9 +128,8 @@ def test_pieces_in_any_order_make_the_same_model(
             late = missing_pairs(planned, early)
             assert len(late) + len(early) == len(planned)
             matches = front.match_pairs(features, late)
-        models.append(
-            reconstruct_from(features, [*early, *matches], SfmWorkspace(tmp_path / str(turn), camera, OPTIONS))
-        )
+        read = {name: ImageFeatures.from_bytes(file.read_bytes()) for name, file in features.items()}
+        models.append(reconstruct_from(read, [*early, *matches], SfmWorkspace(tmp_path / str(turn), camera, OPTIONS)))
     images = {name: path for name, (path, _) in views.items()}
     models.append(reconstruct(images, SfmWorkspace(tmp_path / "one", camera, OPTIONS), T_world_camera_prior=prior))
     for model in models[1:]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import psycopg
 import pytest
 from sqlalchemy import select, text
@@ -26,9 +28,12 @@ from service.store.records import SITE, LeaseHeldError, NewJob, StoreVersionErro
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.processes.forked import run as run_command
 from tests.support.processes.postgres import OTHER, OWNER, ROLE, Cluster
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run
+from tests.support.rig.rig import command
+from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
 pytestmark = [pytest.mark.packages("postgresql"), pytest.mark.timeout(300)]
 
@@ -440,3 +445,67 @@ def test_what_is_sqlites_alone_is_refused_by_name(site: Path, tmp_path: Path, co
     result = CliRunner().invoke(app, ["store", *arguments, "--data", str(site), "--operator", "Ada"][:-2])
     assert result.exit_code == 1
     assert "the record of this site is in PostgreSQL" in " ".join(result.output.split())
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from service.store.store import Store
+with Store.open(Path(sys.argv[1])) as store:
+    print(store.claim_job("this host", 60.0).job_id, flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.slow
+def test_workers_whose_clocks_differ_by_ten_minutes_take_no_job_early(cluster: Cluster, tmp_path: Path) -> None:
+    database = cluster.new_database()
+    site = cluster.site(tmp_path / "site", database)
+    ahead, behind = SteppedClock.from_now(), SteppedClock.from_now()
+    ahead.set_utc(600.0)
+    behind.set_utc(-600.0)
+    with Store.open(site, ahead) as early, Store.open(site, behind) as late:
+        new = [NewJob("detect", "capture", 1, key, {}) for key in ("a", "b")]
+        early.record(start_run(early), [], actor="runner", jobs=new)
+        holder = subprocess.Popen(
+            [sys.executable, "-c", HOLDER, str(site)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        with holder:
+            assert holder.stdout is not None
+            held = holder.stdout.readline().strip()
+            other = late.claim_job("host with a clock that is late", 60.0)
+            assert other is not None
+            assert other.job_id != held
+            for store in (early, late):
+                assert store.claim_job("host", 60.0) is None
+            # On the server, which judges leases, a minute passes.
+            cluster.run(database, "UPDATE jobs SET until_utc_s = until_utc_s - 61")
+            taken = [store.claim_job("host", 60.0) for store in (early, late)]
+            assert {job.job_id for job in taken if job is not None} == {held, other.job_id}
+            assert holder.stdin is not None
+            holder.stdin.close()
+
+
+@pytest.mark.slow
+def test_a_worker_takes_the_kinds_that_it_is_given(site: Path, tmp_path: Path) -> None:
+    camera = camera_of_width(160)
+    picture = tmp_path / "view.png"
+    assert cv2.imwrite(str(picture), render(slabs(), camera, ring_of_poses(3)[0], 1))
+    with Store.open(site) as store:
+        run = start_run(store)
+        ref = store.put_file(picture, kind="image", media_type="image/png", original_name=picture.name)
+        arguments = {
+            "camera": dataclasses.asdict(camera),
+            "effort": {},
+            "images": [{"viewpoint": "view", "sha256": ref.sha256}],
+        }
+        new = [NewJob(kind, "capture", 1, kind, arguments) for kind in ("match", "features")]
+        store.record(run, [], actor="runner", jobs=new)
+    worker = ("worker", "--data", str(site), "--until-idle", "--jobs", "1")
+    ended = run_command(command(*worker, "--kinds", "features", "--json"), timeout_s=200)
+    assert ended.returncode == 0, ended.stderr
+    with Store.open(site) as store:
+        assert {job.kind: job.state for job in store.jobs(run)} == {"match": "queued", "features": "finished"}
+    refused = CliRunner().invoke(app, [*worker, "--kinds", "features,matches"])
+    assert refused.exit_code == 1
+    assert "no kind of job called 'matches'" in " ".join(refused.output.split())

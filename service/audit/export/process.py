@@ -17,6 +17,7 @@ from service.audit.bundle.export import bundle_report, export_bundle, marked_nam
 from service.audit.export.exports import FORMAT
 from service.audit.export.wanted import forget_request, kept_request
 from service.core.errors import ConfigurationError
+from service.machine.executors import computing_as_environment_says
 from service.store.artefacts import chunks_of
 from service.store.disk_space import require_export_space
 from service.store.store import Store
@@ -106,9 +107,12 @@ def main(arguments: list[str]) -> None:
     """Make the export, and write progress and the name of the file to stdout."""
     ends_tidily_when_stopped()
     data, run_id, what, target, actor = arguments
-    report(
-        lambda progress: export(Path(data), run_id, what, Path(target), actor, progress).name, outlives_parent=True
-    )
+
+    def work(progress: Progress) -> str:
+        with computing_as_environment_says():
+            return export(Path(data), run_id, what, Path(target), actor, progress).name
+
+    report(work, outlives_parent=True)
 
 
 if __name__ == "__main__":

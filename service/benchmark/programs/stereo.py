@@ -14,6 +14,7 @@ from service.benchmark.programs.colmap import views_of
 from service.compute.ground_truth.surface import write_ply
 from service.compute.stereo.reconstruct import reconstruct
 from service.core.errors import OrthocaptureError
+from service.machine.executors import computing_as_environment_says
 from service.machine.resources import keep_freed_memory
 
 _USAGE = "usage: python -m service.benchmark.programs.stereo DATA MESH"
@@ -26,7 +27,8 @@ def main() -> None:
     keep_freed_memory()
     cv2.setNumThreads(0)
     try:
-        found = reconstruct(views_of(Path(sys.argv[1])), _tell)
+        with computing_as_environment_says():
+            found = reconstruct(views_of(Path(sys.argv[1])), _tell)
     except OrthocaptureError as error:
         raise SystemExit(str(error)) from error
     write_ply(Path(sys.argv[2]), found, 1.0, {}, ["metres, in the frame of the poses"])

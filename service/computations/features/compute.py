@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,7 +13,6 @@ from service.computations.features import FrontEndArguments
 from service.computations.inputs import photographs
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import Hash
-from service.compute.sfm.colmap_process import ColmapProcess
 from service.compute.sfm.features import ImageFeatures
 from service.compute.sfm.front_end import FrontEnd
 from service.compute.sfm.options import SfmOptions
@@ -27,14 +25,14 @@ def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
     files = photographs(context, images)
     refs = []
     count = 0
-    with front_end(context.arguments) as front:
-        for number, (image, file) in enumerate(zip(images, files, strict=True)):
-            context.progress("features", number, len(images))
-            found = front.extract_features(file)
-            count += len(found.pixels)
-            name = f"{image.viewpoint}.features.npz"
-            media_type = "application/octet-stream"
-            refs.append(context.keep_bytes(found.to_bytes(), kind="sfm_features", media_type=media_type, name=name))
+    context.progress("features", 0, len(images))
+    extracted = front_end(context.arguments).extract_each(files)
+    for number, (image, found) in enumerate(zip(images, extracted, strict=True), 1):
+        count += len(found.pixels)
+        name = f"{image.viewpoint}.features.npz"
+        media_type = "application/octet-stream"
+        refs.append(context.keep_bytes(found.to_bytes(), kind="sfm_features", media_type=media_type, name=name))
+        context.progress("features", number, len(images))
     return JobAnswer({"features_an_image": count / len(images)}, tuple(refs))
 
 
@@ -43,18 +41,6 @@ def read_features(context: JobContext[Any], wanted: Mapping[str, Hash]) -> dict[
     return {name: ImageFeatures.from_bytes(context.input(sha256).read_bytes()) for name, sha256 in wanted.items()}
 
 
-class _ColmapChildren(threading.local):
-    """COLMAP's child process of each thread, by seed; it stays, because starting one takes as long as an image."""
-
-    def __init__(self) -> None:
-        self.children: dict[int, ColmapProcess] = {}
-
-
-_KEPT = _ColmapChildren()
-
-
 def front_end(arguments: FrontEndArguments) -> FrontEnd:
-    """Return the front end of COLMAP for a job, with the child process that this thread keeps."""
-    options = SfmOptions(**arguments.effort.set_fields())
-    child = _KEPT.children.setdefault(options.seed, ColmapProcess(seed=options.seed))
-    return FrontEnd(camera_used(arguments), options, child=child)
+    """Return the front end for a job: jobs run in parallel, so each uses this process alone, or the cluster."""
+    return FrontEnd(camera_used(arguments), SfmOptions(**arguments.effort.set_fields()))

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from service.computations import match as match_job
-from service.computations.features.compute import front_end, read_features
+from service.computations.features.compute import front_end
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import Hash
 from service.compute.sfm.features import PairMatches, pack_matches, unpack_matches
@@ -17,8 +17,8 @@ from service.core.geometry import Transform
 def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
     """Match some pairs of images, and verify the matches geometrically."""
     arguments = context.arguments
-    with front_end(arguments) as front:
-        found = front.match_pairs(read_features(context, arguments.features), arguments.pairs, context.progress)
+    files = {name: context.input(sha256) for name, sha256 in arguments.features.items()}
+    found = front_end(arguments).match_pairs(files, arguments.pairs, context.progress)
     media_type = "application/octet-stream"
     ref = context.keep_bytes(pack_matches(found), kind="sfm_matches", media_type=media_type, name="matches.npz")
     return JobAnswer(

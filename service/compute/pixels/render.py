@@ -132,6 +132,10 @@ class RayMesh:
         self._near = np.ascontiguousarray(vertices_m - self._centre_m, dtype=np.float32)
         self._faces = np.ascontiguousarray(faces[kept], dtype=np.int32)
 
+    def __getstate__(self) -> dict[str, object]:
+        """Return what travels to another process: not the tree, which that builds again."""
+        return {name: value for name, value in self.__dict__.items() if name != "_scene"}
+
     @cached_property
     def _scene(self) -> Any:
         """The tree; many exports need none. Raises ConfigurationError without embreex."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -32,10 +33,11 @@ from service.compute.sfm.options import Progress, reduction
 from service.compute.sfm.track_building import Index, TrackedFeatures, build_tracks, thinned, triangulate, wide_enough
 from service.core.errors import DataError, OrthocaptureError
 from service.core.geometry import Array, align_points
+from service.machine.resources import keep_freed_memory
 
 
 def main(log: str, seed: int, pipe: Connection) -> None:
-    """Process (task, job) messages until the other end is closed; this is the entry point.
+    """Process (task, job) messages until the other end is closed.
 
     Sends ("progress", (stage, done, total)) in between, and ("result", value) or ("error", what) at the end of each.
     """
@@ -463,3 +465,8 @@ def _bundle(model: pycolmap.Reconstruction, settings: Mapping[str, Any], loss_px
     solver.function_tolerance = tolerance
     solver.gradient_tolerance = 1e-10
     pycolmap.bundle_adjustment(model, options)
+
+
+if __name__ == "__main__":
+    keep_freed_memory()
+    main(sys.argv[1], int(sys.argv[2]), Connection(int(sys.argv[3])))

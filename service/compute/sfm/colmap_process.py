@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
-import multiprocessing
 import os
+import subprocess
+import sys
 import tempfile
+import threading
 import time
 import weakref
 from collections.abc import Callable
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, cast
@@ -18,12 +20,8 @@ from service.compute.sfm.options import Progress
 from service.core.errors import ComputeError, DataError, OrthocaptureError
 from service.core.geometry import Transform
 from service.machine.processes import ChildEndedError, ChildLimits, call_in_child
-from service.machine.resources import keep_freed_memory
 
-
-def _child(log: str, seed: int, pipe: Connection) -> None:
-    keep_freed_memory()
-    importlib.import_module("service.compute.sfm.child").main(log, seed, pipe)
+_END_S = 1.0  # that an idle child may take to end itself
 
 
 class ColmapProcess:
@@ -37,7 +35,7 @@ class ColmapProcess:
         self._seed = seed
         self._temporary = log is None
         self._log = log
-        self._process: Any = None
+        self._end: weakref.finalize[[subprocess.Popen[bytes], Connection], Self] | None = None
         self._pipe: Connection | None = None
 
     def __enter__(self) -> Self:
@@ -92,16 +90,10 @@ class ColmapProcess:
 
     def close(self) -> None:
         """End the child; the next task starts a new one."""
-        if self._process is None:
+        if self._end is None:
             return
-        assert self._pipe is not None
-        self._pipe.close()
-        self._process.join(timeout=1)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
-        self._process.close()
-        self._process = self._pipe = None
+        self._end()
+        self._end = self._pipe = None
         if self._temporary and self._log is not None:
             self._log.unlink(missing_ok=True)
             self._log = None
@@ -113,13 +105,16 @@ class ColmapProcess:
                 os.close(handle)
                 self._log = Path(name)
                 weakref.finalize(self, self._log.unlink, missing_ok=True)  # in case nobody closes it
-            context = multiprocessing.get_context("spawn")
-            self._pipe, theirs = context.Pipe()
-            self._process = context.Process(
-                target=_child, args=(str(self._log), self._seed, theirs), daemon=True, name="colmap"
-            )
-            self._process.start()
+            self._pipe, theirs = Pipe()
+            # A worker of a Dask cluster is a daemon of `multiprocessing`, which may have no children of that kind.
+            process = subprocess.Popen(
+                [sys.executable, "-m", "service.compute.sfm.child", str(self._log), str(self._seed),
+                 str(theirs.fileno())],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)},
+                stdin=subprocess.DEVNULL, pass_fds=(theirs.fileno(),),
+            )  # fmt: skip
             theirs.close()
+            self._end = weakref.finalize(self, _end_child, process, self._pipe)
         return self._pipe
 
     def _tail(self) -> str:
@@ -129,6 +124,38 @@ class ColmapProcess:
         except FileNotFoundError:
             return "no log"
         return " | ".join(lines[-3:]) if lines else "empty log"
+
+
+def _end_child(process: subprocess.Popen[bytes], pipe: Connection) -> None:
+    """Close the pipe, at which an idle child ends itself, and kill one that does not."""
+    pipe.close()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+class _ThreadProcesses(threading.local):
+    """COLMAP's child process of each thread, by seed; it stays, because starting one takes as long as an image."""
+
+    def __init__(self) -> None:
+        self.by_seed: dict[int, ColmapProcess] = {}
+
+
+_OF_THREAD = _ThreadProcesses()
+
+
+def thread_process(seed: int) -> ColmapProcess:
+    """Return the child process that this thread keeps from task to task."""
+    return _OF_THREAD.by_seed.setdefault(seed, ColmapProcess(seed=seed))
+
+
+def end_thread_process(seed: int) -> None:
+    """End the child process that this thread keeps, if there is one."""
+    process = _OF_THREAD.by_seed.pop(seed, None)
+    if process is not None:
+        process.close()
 
 
 _SPARE_BYTES = 1 << 30  # beyond what the library itself needs

@@ -20,7 +20,7 @@ from service.compute.hybrid.adjustment import clustered_information, first_guess
 from service.compute.hybrid.bundle import AdjustmentData, BundleState, Rows, Sigmas, linearise, normal_equations
 from service.compute.sfm.colmap_process import ColmapProcess
 from service.compute.sfm.features import ImageFeatures, PairMatches, Tracks
-from service.compute.sfm.front_end import CachedFrontEnd, FrontEnd
+from service.compute.sfm.front_end import CachedFrontEnd, FrontEnd, processes_worth
 from service.compute.sfm.options import Mapper, Progress, SfmOptions, pairs_of
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
@@ -128,10 +128,10 @@ def reconstruct(
     folder.mkdir(parents=True, exist_ok=True)
     pairs = pairs_of(files, T_world_camera_prior, settings, stations=stations)
     seconds: dict[str, float] = {}
-    with FrontEnd(camera, settings, processes=settings.threads, log=folder / "colmap_front.log") as front:
+    with FrontEnd(camera, settings, processes=processes_worth(len(files), len(pairs), camera, settings)) as front:
         kept = CachedFrontEnd(folder, camera, settings, seconds)
         features = kept.features(files, front, progress)
-        matches = kept.matches(features, pairs, front, progress)
+        matches = kept.matches(features, files, pairs, front, progress)
     start = T_world_camera_prior if mapper == "triangulated" else None
     model = reconstruct_from(features, matches, workspace, mapper, T_world_camera_start=start)
     return dataclasses.replace(model, seconds={**seconds, **model.seconds})

@@ -6,32 +6,51 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from service.compute.camera_model import CameraModel
-from service.compute.sfm.colmap_process import ColmapProcess
+from service.compute.sfm.colmap_process import end_thread_process, thread_process
 from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
-from service.compute.sfm.options import Progress, SfmOptions
+from service.compute.sfm.options import Progress, SfmOptions, reduction
 from service.core.errors import DataError
+from service.machine.executors import mapping
 
-Item = TypeVar("Item")
-Answer = TypeVar("Answer")
+PAIRS_A_TASK = 8  # about two seconds; neighbours in the list share an image, whose features are read once
+_FEWEST_MEGAPIXELS, _FEWEST_PAIRS = 16.0, 100  # that are worth further processes; a pair of 3000 features an image
+
+
+@dataclass(frozen=True, slots=True)
+class _Extraction:
+    """The task of extracting the features of one image."""
+
+    file: Path
+    camera: CameraModel
+    options: SfmOptions
+
+
+@dataclass(frozen=True, slots=True)
+class _Matching:
+    """The task of matching some pairs, of images by name, whose features are in files."""
+
+    pairs: tuple[tuple[str, str], ...]
+    files: Mapping[str, Path]
+    camera: CameraModel
+    options: SfmOptions
 
 
 class FrontEnd:
-    """Extracts and matches in child processes that live from one image to the next; close it, or use `with`.
+    """Extracts and matches; close it, or use `with`, unless COLMAP's child process is to stay for later work.
 
-    The results depend only on the images, the camera and the options: bit for bit the same, whatever the order of the
-    images and the number of processes. As images arrive:
+    Tasks are computed by the chosen executor (`service.machine.executors`), each in a child process that the thread
+    which computes keeps from task to task. The results depend only on the images, the camera and the options: bit for
+    bit the same, whatever the order of the images and the number of processes. As images arrive:
 
         with FrontEnd(camera, options) as front:
-            features[name] = front.extract_features(file)
+            found = front.extract_features(file)  # and its bytes are written to features[name]
             begun = [pair for pair in planned if name in pair and features.keys() >= set(pair)]
             matches += front.match_pairs(features, begun)
 
@@ -39,38 +58,18 @@ class FrontEnd:
     already matched ones are used again, `missing_pairs` of them are matched, and `reconstruct_from` maps.
     """
 
-    def __init__(
-        self,
-        camera: CameraModel,
-        options: SfmOptions | None = None,
-        *,
-        processes: int = 1,
-        log: Path | None = None,
-        child: ColmapProcess | None = None,
-    ) -> None:
+    def __init__(self, camera: CameraModel, options: SfmOptions | None = None, *, processes: int = 1) -> None:
         """Prepare the front end; processes are started with the first work.
 
         Args:
             camera: the camera, calibrated at the images' size.
             options: settings.
-            processes: number of children working in parallel, each on one core.
-            log: file for COLMAP's output; None: a temporary one. Further processes write beside it.
-            child: a process to use instead of own children, and leave running.
+            processes: number of processes of this machine that work in parallel; 1: this one, unless a cluster was
+                chosen.
         """
         self._camera = camera
         self._options = options or SfmOptions()
-        self._lent = child is not None
-        self._children = (
-            [child]
-            if child is not None
-            else [
-                ColmapProcess(
-                    seed=self._options.seed,
-                    log=log if log is None or k == 0 else log.with_suffix(f".{k}{log.suffix}"),
-                )
-                for k in range(max(1, processes))
-            ]
-        )
+        self._processes = processes
 
     def __enter__(self) -> Self:
         return self
@@ -81,9 +80,8 @@ class FrontEnd:
         self.close()
 
     def close(self) -> None:
-        """End the child processes, except a borrowed one."""
-        for child in [] if self._lent else self._children:
-            child.close()
+        """End COLMAP's child process of this thread."""
+        end_thread_process(self._options.seed)
 
     def extract_features(self, file: Path) -> ImageFeatures:
         """Extract the features of one image.
@@ -92,7 +90,17 @@ class FrontEnd:
             DataError: the image is missing, unreadable or of another size than the camera.
             ComputeError: COLMAP failed.
         """
-        return self._extracted(self._children[0], file)
+        return _extract(_Extraction(file, self._camera, self._options))
+
+    def extract_each(self, files: Sequence[Path]) -> Iterator[ImageFeatures]:
+        """Extract the features of images in parallel, and yield them in their order.
+
+        Raises:
+            DataError, ComputeError: as `extract_features`.
+        """
+        tasks = [_Extraction(file, self._camera, self._options) for file in files]
+        with mapping(self._processes, len(tasks)) as map_over:
+            yield from map_over(_extract, tasks)
 
     def extract_all(self, files: Mapping[str, Path], progress: Progress | None = None) -> dict[str, ImageFeatures]:
         """Extract features of images by name, in parallel; `progress` is called with ("extract", done, total).
@@ -100,19 +108,23 @@ class FrontEnd:
         Raises:
             DataError, ComputeError: as `extract_features`; the message names the image.
         """
-
-        def work(child: ColmapProcess, name: str) -> ImageFeatures:
-            try:
-                return self._extracted(child, files[name])
-            except DataError as error:
-                raise DataError(f"image {name}: {error.what}", where=error.where, remedy=error.remedy) from error
-
         names = sorted(files)
-        return dict(zip(names, self._spread(work, names, "extract", progress), strict=True))
+        found: dict[str, ImageFeatures] = {}
+        if progress is not None:
+            progress("extract", 0, len(names))
+        try:
+            for features in self.extract_each([files[name] for name in names]):
+                found[names[len(found)]] = features
+                if progress is not None:
+                    progress("extract", len(found), len(names))
+        except DataError as error:
+            name = names[len(found)]
+            raise DataError(f"image {name}: {error.what}", where=error.where, remedy=error.remedy) from error
+        return found
 
     def match_pairs(
         self,
-        features: Mapping[str, ImageFeatures],
+        features: Mapping[str, Path],
         pairs: Iterable[tuple[str, str]],
         progress: Progress | None = None,
     ) -> list[PairMatches]:
@@ -120,61 +132,60 @@ class FrontEnd:
 
         A pair is matched in the order of its names, so (a, b) and (b, a) give the same result.
 
+        Args:
+            features: the file of each image's features, as `ImageFeatures.to_bytes` makes it.
+            pairs: pairs of these names.
+            progress: called after some pairs.
+
         Raises:
+            DataError: a file does not hold features.
             ComputeError: COLMAP failed.
         """
         ordered = sorted({(min(pair), max(pair)) for pair in pairs})
-
-        def work(child: ColmapProcess, pair: tuple[str, str]) -> PairMatches:
-            a, b = (features[name] for name in pair)
-            job = self._job() | {
-                "pixels": (a.pixels, b.pixels),
-                "descriptors": (a.descriptors, b.descriptors),
-            }
-            found = child.run("match", job, timeout_s=self._options.timeout_s)
-            return PairMatches(*pair, found["features"], found["configuration"], found["matrices"])
-
-        return self._spread(work, ordered, "match", progress)
-
-    def _job(self) -> dict[str, Any]:
-        return {"camera": dataclasses.asdict(self._camera), "options": dataclasses.asdict(self._options)}
-
-    def _extracted(self, child: ColmapProcess, file: Path) -> ImageFeatures:
-        job = self._job() | {"file": str(file)}
-        return ImageFeatures(**child.run("extract", job, timeout_s=self._options.timeout_s))
-
-    def _spread(
-        self,
-        work: Callable[[ColmapProcess, Item], Answer],
-        items: Sequence[Item],
-        stage: str,
-        progress: Progress | None,
-    ) -> list[Answer]:
-        """Return the answers in the order of the items, computed by the children in parallel."""
-        free: SimpleQueue[ColmapProcess] = SimpleQueue()
-        for child in self._children:
-            free.put(child)
-
-        def one(item: Item) -> Answer:
-            child = free.get()
-            try:
-                return work(child, item)
-            finally:
-                free.put(child)
-
-        out: list[Answer] = []
+        blocks = [tuple(ordered[k : k + PAIRS_A_TASK]) for k in range(0, len(ordered), PAIRS_A_TASK)]
+        tasks = [
+            _Matching(block, {name: features[name] for pair in block for name in pair}, self._camera, self._options)
+            for block in blocks
+        ]
+        found: list[PairMatches] = []
         if progress is not None:
-            progress(stage, 0, len(items))
-        with ThreadPoolExecutor(len(self._children)) as pool:
-            tasks = [pool.submit(one, item) for item in items]
-            try:
-                for task in tasks:
-                    out.append(task.result())
-                    if progress is not None:
-                        progress(stage, len(out), len(items))
-            finally:
-                pool.shutdown(cancel_futures=True)
-        return out
+            progress("match", 0, len(ordered))
+        with mapping(self._processes, len(tasks)) as map_over:
+            for matches in map_over(_match, tasks):
+                found += matches
+                if progress is not None:
+                    progress("match", len(found), len(ordered))
+        return found
+
+
+def processes_worth(files: int, pairs: int, camera: CameraModel, options: SfmOptions) -> int:
+    """Return the number of processes of this machine for so much work; starting one takes as long as a megapixel."""
+    factor = reduction(options.max_image_size, camera.width, camera.height)
+    megapixels = files * camera.width * camera.height / factor**2 / 1e6
+    worth = megapixels >= _FEWEST_MEGAPIXELS or pairs * (options.max_features / 3000) ** 2 >= _FEWEST_PAIRS
+    return options.threads if worth else 1
+
+
+def _extract(task: _Extraction) -> ImageFeatures:
+    job = _job(task) | {"file": str(task.file)}
+    child = thread_process(task.options.seed)
+    return ImageFeatures(**child.run("extract", job, timeout_s=task.options.timeout_s))
+
+
+def _match(task: _Matching) -> list[PairMatches]:
+    features = {name: ImageFeatures.from_bytes(file.read_bytes()) for name, file in task.files.items()}
+    child = thread_process(task.options.seed)
+    matches: list[PairMatches] = []
+    for pair in task.pairs:
+        a, b = (features[name] for name in pair)
+        job = _job(task) | {"pixels": (a.pixels, b.pixels), "descriptors": (a.descriptors, b.descriptors)}
+        found = child.run("match", job, timeout_s=task.options.timeout_s)
+        matches.append(PairMatches(*pair, found["features"], found["configuration"], found["matrices"]))
+    return matches
+
+
+def _job(task: _Extraction | _Matching) -> dict[str, Any]:
+    return {"camera": dataclasses.asdict(task.camera), "options": dataclasses.asdict(task.options)}
 
 
 def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:
@@ -203,9 +214,7 @@ class CachedFrontEnd:
         self, files: Mapping[str, Path], front: FrontEnd, progress: Progress | None
     ) -> dict[str, ImageFeatures]:
         """Return features of every image; stored ones are used if file, camera and settings are the same."""
-        folder = self.workspace / "features"
-        folder.mkdir(exist_ok=True)
-        kept = {name: folder / f"{_key(file, self.camera, self.settings)}.npz" for name, file in files.items()}
+        kept = self.files(files)
         wanted = {name: files[name] for name, path in kept.items() if not path.is_file()}
         start = time.monotonic()
         fresh = front.extract_all(wanted, progress) if wanted else {}
@@ -218,14 +227,29 @@ class CachedFrontEnd:
             for name in sorted(files)
         }
 
+    def files(self, files: Mapping[str, Path]) -> dict[str, Path]:
+        """Return the file in which the features of each image are stored, or will be."""
+        folder = self.workspace / "features"
+        folder.mkdir(exist_ok=True)
+        return {name: folder / f"{_key(file, self.camera, self.settings)}.npz" for name, file in files.items()}
+
     def matches(
         self,
         features: Mapping[str, ImageFeatures],
+        files: Mapping[str, Path],
         pairs: Sequence[tuple[str, str]],
         front: FrontEnd,
         progress: Progress | None,
     ) -> list[PairMatches]:
-        """Return the matches of exactly these pairs; those in the workspace are used if the features are the same."""
+        """Return the matches of exactly these pairs; those in the workspace are used if the features are the same.
+
+        Args:
+            features: the features of every image.
+            files: the images, whose features `features` has stored.
+            pairs: the pairs.
+            front: the front end that matches the missing ones.
+            progress: called with ("match", done, total).
+        """
         kept = self.workspace / "matches.npz"
         stamp = self.workspace / "matches.json"
         recipe = json.dumps(
@@ -242,7 +266,7 @@ class CachedFrontEnd:
         missing = missing_pairs(pairs, known)
         if missing:
             start = time.monotonic()
-            known += front.match_pairs(features, missing, progress)
+            known += front.match_pairs(self.files(files), missing, progress)
             self.seconds["match"] = time.monotonic() - start
             stamp.unlink(missing_ok=True)
             _write(kept, pack_matches(known))

@@ -10,9 +10,10 @@ import numpy as np
 
 from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.render import RayMesh
+from service.compute.stereo.depth_maps import Pair, depth_maps, stored_views
 from service.compute.stereo.fusion import fused, surface_of
-from service.compute.stereo.matching import DepthMap, depth_of_pair, guided_depth
-from service.compute.stereo.rectify import StereoView, looked_at_m, rectified, stereo_pairs
+from service.compute.stereo.matching import DepthMap
+from service.compute.stereo.rectify import StereoView, looked_at_m, stereo_pairs
 from service.compute.stereo.steep import closed, completed
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -26,12 +27,17 @@ _FEWEST_AT_FIRST, _FEWEST = 3, 2  # then
 Progress = Callable[[str, int, int], None]
 
 
-def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
+def reconstruct(views: Sequence[StereoView], progress: Progress, *, processes: int = 1) -> Surface:
     """Reconstruct the surface that posed images of pinhole cameras show, in the frame and unit of the poses.
 
     A first surface from small images, closed where nothing was matched, is the guess around which larger images are
     matched. The depth of both is fused: the first holds more of what is steep, the second is finer. If there are many
     images, the steep parts that the fused surface misses are searched for last.
+
+    Args:
+        views: the images and their poses.
+        progress: called with what is done, how much is done, and the total.
+        processes: number of processes of this machine that match pairs; 1: this one, unless a cluster was chosen.
 
     Raises:
         ComputeError: no two images can be matched, or no surface comes out.
@@ -39,11 +45,9 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
     small, large = ([_smaller(view, width) for view in views] for width in (COARSE_PX, FINE_PX))
     centre = looked_at_m(small)
     pairs = stereo_pairs(small)
-    coarse: list[DepthMap] = []
-    for k, (one, two) in enumerate(pairs):
-        progress("matching pairs", k, len(pairs))
-        found = depth_of_pair(rectified(small[one], small[two], centre), _distance_m(small, one, two, centre))
-        coarse += [] if found is None else [found]
+    with stored_views(small) as stored:
+        report = _pair_progress(progress, "matching pairs", pairs)
+        coarse = depth_maps(stored, pairs, centre, report, processes=processes)
     if not coarse:
         raise ComputeError("no pair of images could be matched", remedy="Use more images, at smaller angles")
     many = len(coarse) >= _MANY
@@ -51,11 +55,9 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
     first = _surface(coarse, VOXEL_PX * _footprint_m(small, centre), _FEWEST_AT_FIRST if many else 1)
     guess = closed(first)
     near = RayMesh(guess.vertices_m, guess.faces)
-    fine: list[DepthMap] = []
-    for k, (one, two) in enumerate(pairs):
-        progress("matching pairs near the first surface", k, len(pairs))
-        found = guided_depth(rectified(large[one], large[two], centre), near, _distance_m(large, one, two, centre))
-        fine += [] if found is None else [found]
+    report = _pair_progress(progress, "matching pairs near the first surface", pairs)
+    with stored_views(large) as stored:
+        fine = depth_maps(stored, pairs, centre, report, guess=near, processes=processes)
     progress("fusing all depth maps", 0, 0)
     fused_all = _surface([*coarse, *fine], VOXEL_PX * _footprint_m(large, centre), _FEWEST if many else 1)
     if not many:
@@ -70,8 +72,8 @@ def _surface(maps: Sequence[DepthMap], voxel_m: float, least: int) -> Surface:
     return surface_of(fused(maps, voxel_m, least), least)
 
 
-def _distance_m(views: Sequence[StereoView], one: int, two: int, centre_m: Array) -> float:
-    return float(np.linalg.norm(0.5 * (views[one].eye_m + views[two].eye_m) - centre_m))
+def _pair_progress(progress: Progress, what: str, pairs: Sequence[Pair]) -> Callable[[int], None]:
+    return lambda done: progress(what, done, len(pairs))
 
 
 def _footprint_m(views: Sequence[StereoView], centre_m: Array) -> float:

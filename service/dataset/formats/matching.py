@@ -50,11 +50,11 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     stored: `loader.py`, which needs only numpy, computes them for any pair from depth and poses. Overlap is the share
     of the surface's points that both images show. Markers have no depth.
     """
-    truth = _DepthOfViews(dataset)
+    truth = _DepthOfViews(dataset, folder)
     for view in dataset.views:
         folder.file(f"images/{view.file}", lambda view=view: dataset.pixels.picture(view), Part("image", view.name))
         folder.written_by(
-            f"depth/{view.name}.npz",
+            _depth_file(view),
             lambda path, view=view: _depth(path, dataset, truth.depth_m(view)),
             Part("depth", view.name),
         )
@@ -69,8 +69,8 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 class _DepthOfViews:
     """The data computed from the views' depth, once and only when a file needs it."""
 
-    def __init__(self, dataset: DataSet) -> None:
-        self._dataset = dataset
+    def __init__(self, dataset: DataSet, folder: ExportFolder) -> None:
+        self._dataset, self._folder = dataset, folder
         self._seen: dict[str, NDArray[np.bool_]] = {}
         mesh = dataset.mesh
         self._surface = Surface(mesh.vertices_m, mesh.faces)
@@ -80,15 +80,19 @@ class _DepthOfViews:
         pixels = self._dataset.pixels
         shown = pixels.valid(view) & ~pixels.markers(view)
         depth = np.where(shown, pixels.depth_m(view), np.float32(0.0))
-        self._seen[view.name] = points_seen(self._points_m, _ground_truth(view, depth))
+        self._note(view, depth)
         return depth
+
+    def _note(self, view: PosedView, depth_m: NDArray[np.float32]) -> None:
+        self._seen[view.name] = points_seen(self._points_m, _ground_truth(view, depth_m))
 
     @cached_property
     def covisible(self) -> Covisibility:
         """The covisibility of all views."""
         for view in self._dataset.views:
-            if view.name not in self._seen:  # an interrupted export wrote its depth
-                self.depth_m(view)
+            if view.name not in self._seen:  # another process wrote its depth, or an interrupted export
+                with (self._folder.root / _depth_file(view)).open("rb") as file, np.load(file) as archive:
+                    self._note(view, archive["depth_m"])
         return covisibility(np.array([self._seen[view.name] for view in self._dataset.views]))
 
     @cached_property
@@ -105,6 +109,10 @@ class _DepthOfViews:
 
 def _ground_truth(view: PosedView, depth_m: NDArray[np.float32]) -> GroundTruth:
     return GroundTruth(Path("images") / view.file, view.camera.matrix, view.T_world_camera, depth_m)
+
+
+def _depth_file(view: PosedView) -> str:
+    return f"depth/{view.name}.npz"
 
 
 def _depth(path: Path, dataset: DataSet, depth_m: NDArray[np.float32]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -10,9 +11,13 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 import psutil
 
+from service.machine.executors import computing_at
+from service.machine.schedulers import Scheduler
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY
 
@@ -50,14 +55,22 @@ def dask_cluster(
     scheduler = _start([_SCHEDULER, *ports, *security], folder / "scheduler.log", {})
     cluster = Cluster("", folder, security, scheduler)
     try:
-        until(where.is_file, lambda: (folder / "scheduler.log").read_text(encoding="utf-8"))
-        cluster.address = json.loads(where.read_text(encoding="utf-8"))["address"]
+        until(lambda: bool(_address(where)), lambda: (folder / "scheduler.log").read_text(encoding="utf-8"))
+        cluster.address = _address(where)
         for _ in range(workers):
             cluster.add_worker()
         yield cluster
     finally:
         for process in [scheduler, *cluster.workers]:
             end_tree(process)
+
+
+def _address(where: Path) -> str:
+    """Return the address in a scheduler's file; "" while it is being written."""
+    try:
+        return str(json.loads(where.read_text(encoding="utf-8"))["address"])
+    except (FileNotFoundError, json.JSONDecodeError):
+        return ""
 
 
 def end_tree(process: subprocess.Popen[bytes]) -> None:
@@ -76,3 +89,25 @@ def _start(options: Sequence[str], log: Path, environment: Mapping[str, str]) ->
             [sys.executable, "-m", *options], cwd=log.parent, env=own,
             stdin=subprocess.DEVNULL, stdout=output, stderr=output,
         )  # fmt: skip
+
+
+@contextmanager
+def on(cluster: Cluster, patience_s: float = 60.0) -> Generator[None]:
+    """Compute on a cluster that has answered."""
+    with computing_at(Scheduler(cluster.address, patience_s=patience_s)):
+        yield
+
+
+def bits(value: object) -> object:
+    """Return every number of a result as its bits."""
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, value.shape, value.tobytes())
+    if isinstance(value, float):
+        return value.hex()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return [type(value).__name__, *(bits(getattr(value, field.name)) for field in dataclasses.fields(value))]
+    if isinstance(value, Mapping):
+        return [(bits(k), bits(v)) for k, v in cast("Mapping[object, object]", value).items()]
+    if isinstance(value, (list, tuple)):
+        return [bits(part) for part in cast("Sequence[object]", value)]
+    return repr(value)

@@ -1,0 +1,16 @@
+"""The cluster that the tests of a session share."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import pytest
+
+from tests.support.processes.cluster import Cluster, dask_cluster
+
+
+@pytest.fixture(scope="session")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Generator[Cluster]:
+    """Two workers, which no test may leave dead."""
+    with dask_cluster(tmp_path_factory.mktemp("cluster")) as started:
+        yield started
