@@ -46,6 +46,7 @@ class Uploader:
         self._store = store
         self._objects = objects
         self._data = store.database_path.parent
+        self._bucket_found = False
         self.refused: dict[str, str] = {}  # file → why it stays in the spool
 
     def drain(self, stopped: Callable[[], bool] = lambda: False) -> int:
@@ -53,6 +54,9 @@ class Uploader:
 
         Raises ObjectStoreError if the store is away or refuses everything; what was confirmed by then is recorded.
         """
+        if not self._bucket_found:
+            self._objects.require_bucket()
+            self._bucket_found = True
         done = 0
         while not stopped():
             with self._store.database.reading() as connection:
