@@ -18,8 +18,10 @@ from service.core.units import gigabytes
 from service.logs.file_log import file_log
 from service.store.access import kept_to
 from service.store.data_folder import SITE_FILE
+from service.store.objects.anchors import AnchorWriter
 from service.store.objects.copies import Waiting, read_waiting
 from service.store.objects.freeing import SpoolFile, free_spool, spool_files
+from service.store.objects.locked import LockedObjects
 from service.store.objects.opening import open_objects
 from service.store.objects.s3 import S3Objects
 from service.store.objects.upload import Uploader, alone, write_trouble
@@ -50,8 +52,8 @@ def upload_command(
 
     signal.signal(signal.SIGTERM, on_terminate)
     with reporting_errors(json), kept_to(data), Store.open(data, create=False) as store:
-        _site, objects = require_objects(data)
-        uploader = Uploader(store, objects)
+        site, objects = require_objects(data)
+        uploader = Uploader(store, objects, _anchors(store, objects, site))
         if follow:
             with file_log(data, "uploader"):
                 uploader.follow(over)
@@ -86,6 +88,11 @@ def require_objects(data: Path) -> tuple[SiteFile, S3Objects]:
             remedy="Write one as docs/howto/site.md shows",
         )
     return site, open_objects(data, site.object_store)
+
+
+def _anchors(store: Store, objects: S3Objects, site: SiteFile) -> AnchorWriter | None:
+    days = None if site.object_store is None else site.object_store.lock_days
+    return None if days is None else AnchorWriter(store, LockedObjects(objects), days)
 
 
 def _waiting(store: Store, objects: S3Objects) -> Waiting:

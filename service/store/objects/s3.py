@@ -82,6 +82,11 @@ class S3Objects:
         """The name of the place in records and messages, without keys."""
         return self._place
 
+    @property
+    def prefix(self) -> str:
+        """The prefix of all keys, without a slash at its end; "" for none."""
+        return self._prefix
+
     def key(self, name: str) -> str:
         """Return the key of an object in the bucket."""
         sharded = f"{name[:2]}/{name}"

@@ -15,9 +15,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
+from service.core.text.words import counted
 from service.store.artefacts import relative_path
 from service.store.data_folder import object_store_of
 from service.store.durable_effects import utc_text
+from service.store.objects.anchors import AnchorWriter
 from service.store.objects.copies import Recorded, Waiting, next_waiting, read_waiting, write_confirmed
 from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
 from service.store.store import Store
@@ -42,22 +44,24 @@ class UploadTrouble:
 class Uploader:
     """Drains the spool of one data folder into its object store."""
 
-    def __init__(self, store: Store, objects: ObjectStore) -> None:
+    def __init__(self, store: Store, objects: ObjectStore, anchors: AnchorWriter | None = None) -> None:
         self._store = store
         self._objects = objects
+        self._anchors = anchors
         self._data = store.database_path.parent
         self._bucket_found = False
         self.refused: dict[str, str] = {}  # file → why it stays in the spool
 
     def drain(self, stopped: Callable[[], bool] = lambda: False) -> int:
-        """Upload what waits, each file once. Returns how many files were confirmed; `refused` says which were not.
+        """Anchor what was signed and upload what waits, each file once. Returns how many files were confirmed.
 
-        Raises ObjectStoreError if the store is away or refuses everything; what was confirmed by then is recorded.
+        `refused` says which were not. Raises ObjectStoreError if the store is away or refuses everything; what was
+        confirmed by then is recorded. Anchors that are refused keep no file waiting: that is raised at the end.
         """
         if not self._bucket_found:
             self._objects.require_bucket()
             self._bucket_found = True
-        done = 0
+        done, unanchored = 0, self._anchor(stopped)
         while not stopped():
             with self._store.database.reading() as connection:
                 waiting = next_waiting(connection, self._objects.place, list(self.refused), _AT_ONCE)
@@ -77,7 +81,30 @@ class Uploader:
             finally:
                 write_confirmed(self._store, self._objects.place, confirmed, utc_text(self._store.clock.utc_now()))
             done += len(confirmed)
+            unanchored = self._anchor(stopped)
+        if unanchored is not None:
+            raise unanchored
         return done
+
+    def _anchor(self, stopped: Callable[[], bool]) -> StoreError | None:
+        """Anchor what was signed since; returns what forbids it. Raises ObjectStoreAwayError."""
+        if self._anchors is None:
+            return None
+        try:
+            self._anchors.write(stopped)
+        except ObjectStoreAwayError:
+            raise
+        except StoreError as error:
+            _LOG.error("the evidence is not anchored: %s", error.what)
+            return error
+        if self._anchors.beyond:
+            lines = counted(self._anchors.beyond, "line")
+            return StoreError(
+                f"the object store holds anchors of {lines} that the log of signatures does not have",
+                where=self._objects.place,
+                remedy="It was rolled back: keep the data folder as it is, and run `orthocapture audit verify all`",
+            )
+        return None
 
     def _upload(self, file: Recorded) -> str:
         """Bring one file into the store. Returns "" once the store has confirmed it, else why it has not.
@@ -180,7 +207,7 @@ class UploadState:
         if self.trouble is None:
             return self.waiting.sentence
         since = self.trouble.since_utc[:16].replace("T", " ")
-        return f"{self.waiting.sentence}; nothing is uploaded since {since} UTC: {self.trouble.what}"
+        return f"{self.waiting.sentence}; trouble since {since} UTC: {self.trouble.what}"
 
 
 def upload_state(store: Store) -> UploadState | None:
