@@ -16,6 +16,7 @@ from service.core.errors import ConfigurationError
 from service.core.text.words import counted
 from service.core.units import gigabytes
 from service.logs.file_log import file_log
+from service.machine.resources import compute_in_background
 from service.store.access import kept_to
 from service.store.data_folder import SITE_FILE
 from service.store.objects.anchors import AnchorWriter
@@ -24,7 +25,8 @@ from service.store.objects.freeing import SpoolFile, free_spool, spool_files
 from service.store.objects.locked import LockedObjects
 from service.store.objects.opening import open_objects
 from service.store.objects.s3 import S3Objects
-from service.store.objects.upload import Uploader, alone, write_trouble
+from service.store.objects.spool import write_trouble
+from service.store.objects.upload import Uploader, alone
 from service.store.site import SiteFile, load_site
 from service.store.store import Store
 
@@ -55,6 +57,7 @@ def upload_command(
         site, objects = require_objects(data)
         uploader = Uploader(store, objects, _anchors(store, objects, site))
         if follow:
+            compute_in_background()
             with file_log(data, "uploader"):
                 uploader.follow(over)
             return

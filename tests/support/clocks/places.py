@@ -69,6 +69,8 @@ PLACES = {
     "service/store/objects/anchors.py": "until when an anchor is locked, and the day of a root",
     "service/store/objects/locked.py": "times that the object store states",
     "service/store/verification/anchor_checks.py": "age of signatures without an anchor, against a patience of hours",
+    "service/store/objects/copies.py": "how much was recorded in the last hour, which is shown",
+    "service/store/objects/spool.py": "since when no uploader has counted, which is shown",
     "service/store/objects/freeing.py": "age of a file that may leave the spool; the object store has confirmed it",
     "service/store/objects/probe.py": "until when a tried object is locked",
     "service/store/objects/reading.py": "which fetched copy was used last",
