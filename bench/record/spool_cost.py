@@ -34,6 +34,10 @@ from tests.support.processes.object_store import Weed
 from tests.support.record.store import captured, start_run
 
 ABSENT, PRESENT, AWAY = "no object store", "object store present", "object store away"
+_READS = (
+    "Pages of the database are read again after another process has written, as an uploader does once it has rows of "
+    "`copies`,\nand as any worker does: hence the read calls. Everything that a capture writes is the same."
+)
 _FIGURES = ("median_ms", "p95_ms", "ratio_of_medians", "median_of_paired_ratios")
 KINDS = (ABSENT, PRESENT, AWAY)
 _UPLOADER = [sys.executable, "-m", "service.cli.main", "store", "upload", "--follow"]
@@ -186,6 +190,7 @@ def _report(about: dict[str, Any]) -> str:
     lines += [f"| data folder | {' | '.join(names)} |", f"|---{'|---' * len(names)}|"]
     for name in KINDS:
         lines.append(f"| {name} | {' | '.join(str(about['done'][name].get(call, 0)) for call in names)} |")
+    lines += ["", _READS]
     return "\n".join(lines) + "\n"
 
 
