@@ -397,10 +397,10 @@ def _print_report(report: AuditReport) -> None:
         f"({megabytes(report.bytes_hashed):.1f} MB read again), {counted(report.jobs, 'job')}, "
         f"{counted(report.checkpoints, 'signature')}."
     )
-    if report.anchors is not None:
+    if report.anchors is not None and not report.not_compared:
         console.print(
-            f"Compared with the object store: {counted(report.anchors.lines, 'anchored line')} of signatures and "
-            f"{counted(report.anchors.heads, 'end')} of chains in {counted(report.anchors.roots, 'daily root')}."
+            f"Compared with the object store: {counted(report.anchors.lines, 'anchored signature')}, "
+            f"{counted(report.anchors.roots, 'daily root')} with {counted(report.anchors.heads, 'end')} of chains."
         )
     for run_id, head in report.heads.items():
         console.print(f"  {run_id} ends with {head}")

@@ -13,6 +13,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from service.audit.overview.first_page import verified
+from service.audit.verify.verifications import verification_of
 from service.cli.main import app
 from service.store.durable_effects import SystemClock, utc_text
 from service.store.objects.anchor_forms import ROOTS, LineAnchor, RootAnchor, line_name, merkle_root
@@ -109,7 +111,7 @@ def test_every_line_and_the_ends_of_the_day_are_locked_and_compared(site: Site) 
     assert site.anchor() == 0, "another process finds that nothing is missing"
     said = CliRunner().invoke(app, ["audit", "verify", "all", "--data", str(site.data)])
     assert said.exit_code == 0, said.output
-    assert f"{len(site.lines())} anchored lines" in " ".join(said.output.split())
+    assert f"{len(site.lines())} anchored signatures" in " ".join(said.output.split())
 
 
 def test_signatures_are_anchored_later_and_beside_files_after_the_store_was_away(site: Site) -> None:
@@ -137,6 +139,10 @@ def test_with_the_store_away_it_is_counted_and_never_called_verified(site: Site)
     assert (report.anchors.lines_not_compared, report.anchors.heads_not_compared) == (len(site.lines()), 3)
     assert report.not_compared[0] in report.notes
     assert "does not answer" in report.not_compared[0]
+    run_id = report.runs[0]
+    shown = verification_of(report, run_id, by="Ada", at_utc="2026-11-28T12:00:00.000000Z", duration_s=1.0)
+    assert verified(shown, report.heads[run_id]) == "partial"
+    assert list(shown.limits) == list(report.not_compared), "the page says it in the open"
     said = CliRunner().invoke(app, ["audit", "verify", "all", "--data", str(site.data)])
     assert said.exit_code == 1
     assert "NOT verified as a whole" in said.output
@@ -318,7 +324,7 @@ def test_a_line_that_is_older_than_the_lock_needs_no_anchor(site: Site) -> None:
     assert lines is not None
     later = replace(anchors, at=anchors.at + timedelta(days=LOCKED_DAYS, hours=1), patience=timedelta())
     found = compare(later, Record(lines, {}, {}, every_run=False))
-    assert any("has no anchor any more: it is older than 2 days" in note for note in found.notes)
+    assert any("no anchor any more, up to line" in note for note in found.notes)
     assert not any("has no anchor in the object store" in fault.what for fault in found.faults)
     sooner = replace(later, at=anchors.at + timedelta(hours=1))
     assert any(

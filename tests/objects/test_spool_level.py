@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -121,7 +122,8 @@ def test_status_and_doctor_say_bytes_age_and_how_long_the_disk_lasts(tmp_path: P
         assert level.bytes_per_hour > 7_000_000
         assert level.lasts_hours is not None
         assert level.free_bytes > 0
-        assert "GB are free on this disk, which last" in level.sentence
+        assert "GB are free on this disk" in level.sentence
+        assert "which last 5.0 hours at" in replace(level, lasts_hours=5.0).sentence
     (tmp_path / "rig.yaml").write_text("name: bare\nsimulated: true\ndevices: {}\n")
     for arguments in (["status", "latest"], ["doctor", "--rig", str(tmp_path / "rig.yaml")]):
         said = " ".join(CliRunner().invoke(app, [*arguments, "--data", str(data)]).output.split())

@@ -19,6 +19,7 @@ from service.store.objects.copies import Waiting, is_confirmed, read_rate, read_
 from service.store.store import Store
 
 STATE, LEVEL = Path("monitor", "upload.json"), Path("monitor", "spool.json")
+_WORTH_SAYING_HOURS = 30 * 24.0  # a disk that lasts longer needs nobody's attention
 _SILENT_S = 180.0  # an uploader that is at work writes more often
 
 
@@ -117,7 +118,7 @@ class SpoolLevel:
             since = self.trouble.since_utc[:16].replace("T", " ")
             parts.append(f"trouble since {since} UTC: {self.trouble.what}")
         free = f"{gigabytes(self.free_bytes):.1f} GB are free on this disk"
-        if self.lasts_hours is not None:
+        if self.lasts_hours is not None and self.lasts_hours < _WORTH_SAYING_HOURS:
             rate = f"{gigabytes(self.bytes_per_hour):.3g} GB an hour, as of late"
             free += f", which last {self.lasts_hours:.1f} hours at {rate}"
         return "; ".join([*parts, free])

@@ -233,19 +233,24 @@ def _check_missing(
             found.faults.append(Fault(None, None, f"{LOG_NAME}, line {line.number}", what))
     if waiting:
         found.notes.append(
-            f"{counted(len(waiting), 'line')} of {LOG_NAME} has no anchor in the object store yet, the oldest since "
+            f"{_lines(waiting, 'has', 'have')} no anchor in the object store yet, the oldest since "
             f"{_text(min(waiting))}"
         )
     if over:
         found.notes.append(
-            f"{counted(len(over), 'line')} of {LOG_NAME}, up to line {over[-1]}, has no anchor any more: it is older "
+            f"{_lines(over, 'has', 'have')} no anchor any more, up to line {over[-1]}: older "
             f"than {counted(anchors.lock_days, 'day')}, for which anchors are locked"
         )
     if late:
         found.notes.append(
-            f"{counted(len(late), 'line')} of {LOG_NAME} (the first is line {late[0]}) was anchored later than "
+            f"{_lines(late, 'was', 'were')} anchored later (the first is line {late[0]}) than "
             f"{_hours(anchors.patience)} after its signature: until then no anchor covered it"
         )
+
+
+def _lines(found: Sequence[object], one: str, several: str) -> str:
+    """Return the beginning of a sentence on lines of the log, with its verb."""
+    return f"{counted(len(found), 'line')} of {LOG_NAME} {one if len(found) == 1 else several}"
 
 
 def _hours(patience: timedelta) -> str:

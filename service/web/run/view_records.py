@@ -184,7 +184,7 @@ def _spool(level: SpoolLevel) -> Reading:
         return Reading("Object store", "has all files")
     value = f"{counted(waiting.files, 'file')} to send, {size_words(waiting.size_bytes)}"
     since = f"since {time_here(waiting.since_utc)}"
-    lasts = "" if level.lasts_hours is None else f", disk lasts {level.lasts_hours:.1f} h"
+    lasts = f", disk lasts {level.lasts_hours:.1f} h" if level.lasts_hours and level.lasts_hours < 1000 else ""
     if level.trouble is None:
         return Reading("Object store", value, "", f"{since}{lasts}")
     return Reading("Object store", value, "attention", f"{since}: {level.trouble.what}{lasts}")
