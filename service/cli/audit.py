@@ -45,6 +45,7 @@ from service.people.person import ROLES, NotAllowedError, Permission, may
 from service.run_acts import release_run, require_releasable
 from service.run_start import recorded_run
 from service.store.access import kept_to
+from service.store.data_folder import data_folder
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
 from service.store.runs import resolve_run
@@ -130,6 +131,12 @@ def _require_verified(store: Store, run_id: str, *, quiet: bool) -> None:
         raise IntegrityError(
             f"the evidence does not verify: {found.first_fault}", where=run_id, remedy="Nothing is released"
         )
+    if found.not_compared:
+        raise IntegrityError(
+            f"the evidence is not verified: {found.not_compared[0]}",
+            where=run_id,
+            remedy="Release it when the object store answers",
+        )
 
 
 audit_app = typer.Typer(
@@ -182,11 +189,21 @@ def verify_command(
             help="Believe the object store's own SHA-256 of files that only it has, instead of fetching them.",
         ),
     ] = False,
+    anchors: Annotated[
+        Path | None,
+        typer.Option(
+            "--anchors",
+            metavar="PATH",
+            exists=True,
+            help="A site.yaml in another place, or its folder, that names the object store of the anchors.",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Verify the evidence: hash every file again, follow the chain, check the signatures, and name the first fault.
 
-    The exit status is 0 if everything is as it was recorded, and 1 if anything differs.
+    The exit status is 0 if everything is as it was recorded, and 1 if anything differs or could not be compared with
+    its anchors in the object store.
     """
     with reporting_errors(json):
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
@@ -199,13 +216,14 @@ def verify_command(
                 certificates=certificates,
                 signatures_copy=signatures,
                 stated_hashes=stated_hashes,
+                anchors_of=None if anchors is None else data_folder(anchors),
             ).with_limits()
         _tell_the_pages(data, report, time.monotonic() - begun_s)
     if json:
         print_json(report_json(report))
     else:
         _print_report(report)
-    if not report.ok:
+    if not report.verified:
         raise typer.Exit(ExitStatus.FAILED)
 
 
@@ -326,6 +344,8 @@ def report_json(report: AuditReport) -> dict[str, Any]:
     first = None if report.first_fault is None else {**asdict(report.first_fault), "text": str(report.first_fault)}
     fields = asdict(report)
     del fields["not_judged"]  # among the notes
+    if report.anchors is None:
+        del fields["anchors"], fields["not_compared"]
     return {"ok": report.ok, "first_fault": first, **fields}
 
 
@@ -377,12 +397,20 @@ def _print_report(report: AuditReport) -> None:
         f"({megabytes(report.bytes_hashed):.1f} MB read again), {counted(report.jobs, 'job')}, "
         f"{counted(report.checkpoints, 'signature')}."
     )
+    if report.anchors is not None and not report.not_compared:
+        console.print(
+            f"Compared with the object store: {counted(report.anchors.lines, 'anchored signature')}, "
+            f"{counted(report.anchors.roots, 'daily root')} with {counted(report.anchors.heads, 'end')} of chains."
+        )
     for run_id, head in report.heads.items():
         console.print(f"  {run_id} ends with {head}")
     for key_id in report.key_ids:
         console.print(f"  signed with key {key_id}")
     for note in report.notes:
         console.tell(("  note:", "yellow"), f" {note}")
+    if report.ok and report.not_compared:
+        console.tell(("NOT verified as a whole.", "bold yellow"), " Nothing differs, but anchors were not compared.")
+        return
     if report.first_fault is None:
         console.tell(("Verified:", "bold green"), " everything is as it was recorded.")
         return

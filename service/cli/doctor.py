@@ -48,6 +48,7 @@ from service.store.durable_effects import Clock, DurableFiles, SystemClock
 from service.store.mounts import why_unsafe
 from service.store.objects.opening import open_objects
 from service.store.objects.probe import ProbeResult, probe
+from service.store.objects.spool import SpoolLevel, spool_level
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
@@ -87,6 +88,7 @@ def doctor_command(
         unsafe = why_unsafe(existing)
         place = _second_place(rig_file, data)
         objects = _object_store(data)
+        spool = _spool(data)
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
     healthy = healthy and not any(tried.problem for tried in objects)
@@ -107,6 +109,7 @@ def doctor_command(
                 "host_clock": found_clock,
                 "missing": missing,
                 "second_place": place or None,
+                "spool": None if spool is None else dataclasses.asdict(spool),
                 "object_store": {tried.name: tried.problem or "ok" for tried in objects} or None,
             }
         )
@@ -125,6 +128,8 @@ def doctor_command(
         for tried in objects:
             mark = ("!", "bold red") if tried.problem else ("✓", "bold green")
             console.tell(mark, f" object store: {tried.name}", f": {tried.problem}" if tried.problem else "")
+        if spool is not None:
+            console.print(f"object store: {spool.sentence}", markup=False)
     if not healthy:
         raise typer.Exit(ExitStatus.FAILED)
 
@@ -136,6 +141,14 @@ def _object_store(data: Path) -> list[ProbeResult]:
         return []
     clock = SystemClock()
     return probe(open_objects(data, section, clock), clock, lock_days=section.lock_days)
+
+
+def _spool(data: Path) -> SpoolLevel | None:
+    """Return what waits for the object store; None without one, or before anything was recorded."""
+    if object_store_of(data) is None or not has_database(data):
+        return None
+    with Store.open(data, create=False) as store:
+        return spool_level(store)
 
 
 def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | OrthocaptureError]:

@@ -16,13 +16,17 @@ from service.core.errors import ConfigurationError
 from service.core.text.words import counted
 from service.core.units import gigabytes
 from service.logs.file_log import file_log
+from service.machine.resources import compute_in_background
 from service.store.access import kept_to
 from service.store.data_folder import SITE_FILE
+from service.store.objects.anchors import AnchorWriter
 from service.store.objects.copies import Waiting, read_waiting
 from service.store.objects.freeing import SpoolFile, free_spool, spool_files
+from service.store.objects.locked import LockedObjects
 from service.store.objects.opening import open_objects
 from service.store.objects.s3 import S3Objects
-from service.store.objects.upload import Uploader, alone, write_trouble
+from service.store.objects.spool import write_trouble
+from service.store.objects.upload import Uploader, alone
 from service.store.site import SiteFile, load_site
 from service.store.store import Store
 
@@ -50,9 +54,10 @@ def upload_command(
 
     signal.signal(signal.SIGTERM, on_terminate)
     with reporting_errors(json), kept_to(data), Store.open(data, create=False) as store:
-        _site, objects = require_objects(data)
-        uploader = Uploader(store, objects)
+        site, objects = require_objects(data)
+        uploader = Uploader(store, objects, _anchors(store, objects, site))
         if follow:
+            compute_in_background()
             with file_log(data, "uploader"):
                 uploader.follow(over)
             return
@@ -86,6 +91,11 @@ def require_objects(data: Path) -> tuple[SiteFile, S3Objects]:
             remedy="Write one as docs/howto/site.md shows",
         )
     return site, open_objects(data, site.object_store)
+
+
+def _anchors(store: Store, objects: S3Objects, site: SiteFile) -> AnchorWriter | None:
+    days = None if site.object_store is None else site.object_store.lock_days
+    return None if days is None else AnchorWriter(store, LockedObjects(objects), days)
 
 
 def _waiting(store: Store, objects: S3Objects) -> Waiting:

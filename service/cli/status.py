@@ -36,7 +36,7 @@ from service.store.durable_effects import moment_of
 from service.store.store import Store
 
 if TYPE_CHECKING:
-    from service.store.objects.upload import UploadState
+    from service.store.objects.spool import SpoolLevel
 
 
 def status_command(
@@ -100,13 +100,13 @@ def status_command(
         console.print(line)
 
 
-def _uploading(store: Store) -> UploadState | None:
+def _uploading(store: Store) -> SpoolLevel | None:
     """Return what waits for the site's object store; None without a site.yaml, which nothing else is read for."""
     if not (store.database_path.parent / SITE_FILE).is_file():
         return None
-    from service.store.objects.upload import upload_state  # noqa: PLC0415 - for sites only
+    from service.store.objects.spool import spool_level  # noqa: PLC0415 - for sites only
 
-    return upload_state(store)
+    return spool_level(store)
 
 
 _STANDINGS: dict[Standing, str] = {

@@ -30,7 +30,8 @@ class ObjectStoreSection(_Strict):
     endpoint: str  # https://HOST[:PORT]
     region: str = Field(default="us-east-1", pattern=r"[a-z0-9-]{1,40}")
     keys: Literal["environment"] | Path = "environment"  # or a file of the owner's alone, relative to the data folder
-    lock_days: int | None = Field(default=None, ge=1, le=36_500)
+    lock_days: int | None = Field(default=None, ge=1, le=36_500)  # with it, anchors of the evidence are locked there
+    anchor_within_hours: float = Field(default=24.0, ge=0, le=8_760, allow_inf_nan=False)  # then a verification asks
 
     @field_validator("url")
     @classmethod

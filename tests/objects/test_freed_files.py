@@ -31,9 +31,9 @@ VERIFY = ["audit", "verify", "all", "--stated-hashes", "--json", "--data"]
 AT_ONCE = SpoolSection(free_after_days=0)
 
 
-def uploaded(weed: Weed, folder: Path, **spool: float) -> tuple[Store, Bench, S3Objects]:
+def uploaded(weed: Weed, folder: Path, cache_gb: float = 20.0) -> tuple[Store, Bench, S3Objects]:
     """A run that has ended, all of whose files the object store has confirmed."""
-    objects = weed.write_site(folder / "data", free_after_days=0, **spool)
+    objects = weed.write_site(folder / "data", free_after_days=0, cache_gb=cache_gb)
     store = bench_store(folder / "data")
     bench = begin_run(store, PROTOCOL, folder)
     assert bench.run().terminal

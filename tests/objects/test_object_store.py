@@ -111,4 +111,18 @@ def test_the_doctor_names_what_it_tried_and_what_failed(weed: Weed, tmp_path: Pa
     (data / "store_keys.yaml").write_text("{access_key_id: stranger, secret_access_key: wrong}")
     refused = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert refused.exit_code == 1
-    assert "refused" in json.loads(refused.output)["object_store"]["a new object is stored"]
+    assert "refused" in json.loads(refused.output)["object_store"]["the bucket exists"]
+
+
+def test_the_doctor_refuses_a_misspelt_bucket_by_name_and_makes_none(weed: Weed, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("name: bare\nsimulated: true\ndevices: {}\n")
+    data = tmp_path / "data"
+    weed.write_site(data)
+    (data / "site.yaml").write_text((data / "site.yaml").read_text().replace("s3://ready/", "s3://redy/"))
+    arguments = ["doctor", "--rig", str(tmp_path / "rig.yaml"), "--data", str(data), "--json"]
+    for _ in range(2):  # the keys of the tests may do everything: a put would make it
+        refused = CliRunner().invoke(app, arguments, catch_exceptions=False)
+        assert refused.exit_code == 1
+        assert json.loads(refused.output)["object_store"] == {
+            "the bucket exists": "the object store has no bucket 'redy'"
+        }

@@ -17,8 +17,9 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.store.database.tables import copies
 from service.store.objects.copies import read_waiting
-from service.store.objects.interface import ObjectStore, ObjectStoreAwayError
-from service.store.objects.upload import Uploader, read_trouble
+from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
+from service.store.objects.spool import read_trouble
+from service.store.objects.upload import Uploader
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.object_store import Weed
@@ -81,12 +82,24 @@ def test_a_file_that_was_altered_or_that_the_store_holds_otherwise_is_not_confir
         assert confirmed(store) == recorded(store, bench) - {altered, forged}
 
 
+def test_a_bucket_that_is_not_there_is_not_made_by_an_upload(weed: Weed, tmp_path: Path) -> None:
+    weed.write_site(tmp_path / "data")
+    store, _bench = finished(tmp_path)
+    with store:
+        misspelt = weed.objects("raedy", "site")
+        with pytest.raises(ObjectStoreError, match="no bucket 'raedy'"):
+            Uploader(store, misspelt).drain()
+        with pytest.raises(ObjectStoreError, match="no bucket"):
+            misspelt.require_bucket()
+        assert confirmed(store) == set()
+
+
 class Interrupted:
     """A store that calls a function before each put."""
 
     def __init__(self, objects: ObjectStore, before_put: Callable[[int], None]) -> None:
         self._objects, self._before_put, self._puts = objects, before_put, 0
-        self.stat, self.chunks = objects.stat, objects.chunks
+        self.require_bucket, self.stat, self.chunks = objects.require_bucket, objects.stat, objects.chunks
         self.fetch, self.list, self.delete = objects.fetch, objects.list, objects.delete
 
     @property

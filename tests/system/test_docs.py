@@ -112,6 +112,9 @@ RUN_ELSEWHERE = {
     "orthocapture store gc --spool --remove --data runs": (
         "tests/objects/test_freed_files.py::test_the_command_lists_and_frees"
     ),
+    "orthocapture audit verify all --data runs --anchors FOLDER": (
+        "tests/objects/test_anchors.py::test_who_takes_the_lock_out_of_the_site_file_is_found_with_a_copy_of_it"
+    ),
     "orthocapture compare RUN OTHER --data runs": (
         "tests/audit/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
     ),

@@ -161,12 +161,17 @@ class ListedRun:
 
 
 def verified(verification: Verification | None, head_sha256: str) -> str:
-    """Return the state of a verification: "never", "faults", "outdated" (there are newer events) or "current"."""
+    """Return the state of a verification: "never", "faults", "outdated", "partial" or "current".
+
+    It is outdated if there are newer events, and partial if its anchors in the object store could not be read.
+    """
     if verification is None:
         return "never"
     if not verification.ok:
         return "faults"
-    return "current" if verification.head_sha256 == head_sha256 else "outdated"
+    if verification.head_sha256 != head_sha256:
+        return "outdated"
+    return "partial" if verification.not_compared else "current"
 
 
 def matches(run: ListedRun, wanted: RunFilter) -> bool:

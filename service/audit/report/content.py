@@ -177,6 +177,10 @@ def _sections(
 
 
 def _verification(audit: AuditReport) -> TableCell:
+    if audit.ok and not audit.verified:
+        return TableCell(
+            "The evidence is not verified as a whole: nothing differs, but its anchors could not be read", "attention"
+        )
     if audit.first_fault is None:
         return TableCell("The evidence verifies: every file and every record is as it was recorded", "ok")
     others = len(audit.faults) - 1

@@ -196,7 +196,7 @@ def _checked(run: RecordedRun, audit: AuditReport) -> DescriptionList:
     rows: list[tuple[str, TableCell | str]] = [
         (
             "Evidence",
-            TableCell("verified", "ok") if audit.ok else TableCell(counted(len(audit.faults), "fault"), "stop"),
+            _verdict(audit),
         ),
         (
             "Records walked",
@@ -215,6 +215,12 @@ def _checked(run: RecordedRun, audit: AuditReport) -> DescriptionList:
     names = ("Public key, fingerprint (SHA-256)", "Later public key, fingerprint")
     rows += [(names[min(n, 1)], key_id) for n, key_id in enumerate(audit.key_ids)]
     return DescriptionList(tuple(rows))
+
+
+def _verdict(audit: AuditReport) -> TableCell:
+    if not audit.ok:
+        return TableCell(counted(len(audit.faults), "fault"), "stop")
+    return TableCell("verified", "ok") if audit.verified else TableCell("not verified as a whole", "attention")
 
 
 def _faults(audit: AuditReport) -> Iterator[Block]:

@@ -37,6 +37,7 @@ class Outcome(Record):
     fault_count: int
     notes: tuple[str, ...]
     duration_s: float
+    not_compared: tuple[str, ...] = ()  # what could not be compared with the anchors in the object store
 
     @property
     def limits(self) -> list[str]:
@@ -79,6 +80,7 @@ def _outcome(report: AuditReport, run_id: str, faults: Sequence[Fault], duration
         fault_count=len(faults),
         notes=(*together, *report.notes)[:LISTED],
         duration_s=duration_s,
+        not_compared=report.not_compared,
     )
 
 

@@ -39,6 +39,10 @@ class ObjectStore(Protocol):
         """The name of the place in records and messages, without keys."""
         ...
 
+    def require_bucket(self) -> None:
+        """Raise ObjectStoreError, with its name, if there is no such bucket: some stores make one at a first put."""
+        ...
+
     def put_if_absent(self, sha256: str, path: Path) -> bool:
         """Store a file unless an object of this name exists, whatever it holds. Returns whether it was stored.
 

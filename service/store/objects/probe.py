@@ -35,6 +35,7 @@ def probe(objects: S3Objects, clock: Clock, *, lock_days: int | None = None) -> 
     content = f"canary of orthocapture {secrets.token_hex(16)}".encode()
     sha256 = hashlib.sha256(content).hexdigest()
     tried: list[tuple[str, Callable[[], None]]] = [
+        ("the bucket exists", objects.require_bucket),
         ("a new object is stored", lambda: _store_canary(objects, sha256, content)),
         ("a second put of other bytes loses", lambda: _put_again(objects, sha256)),
         ("bytes that do not have the stated SHA-256 are refused", lambda: _put_wrong(objects)),

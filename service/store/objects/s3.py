@@ -56,6 +56,7 @@ class S3Objects:
         require_obstore()
         from obstore.store import S3Store  # noqa: PLC0415 - an optional package
 
+        self._bucket = bucket
         self._place = f"s3://{bucket}/{prefix}".rstrip("/") + f" at {endpoint}"
         self._prefix = prefix.strip("/")
         self.requests = SignedRequests(endpoint, bucket, region, keys, clock)
@@ -81,10 +82,26 @@ class S3Objects:
         """The name of the place in records and messages, without keys."""
         return self._place
 
+    @property
+    def prefix(self) -> str:
+        """The prefix of all keys, without a slash at its end; "" for none."""
+        return self._prefix
+
     def key(self, name: str) -> str:
         """Return the key of an object in the bucket."""
         sharded = f"{name[:2]}/{name}"
         return f"{self._prefix}/{sharded}" if self._prefix else sharded
+
+    def require_bucket(self) -> None:
+        """Raise ObjectStoreError, with its name, if there is no such bucket: some stores make one at a first put."""
+        answer = self.requests.send("HEAD")
+        if answer.status == 404:
+            raise ObjectStoreError(
+                f"the object store has no bucket {self._bucket!r}",
+                where=self._place,
+                remedy="Correct url in site.yaml, or make the bucket: nothing is put into one that is not there",
+            )
+        require_success(answer, self._place)
 
     def put_if_absent(self, sha256: str, path: Path) -> bool:
         """Store a file in one conditional request, unless an object of this name exists. Says whether it was stored.

@@ -54,6 +54,7 @@ class LogLine:
         message: the bytes that are signed.
         key_id: fingerprint of the key that signed the line.
         signature: the signature in base64.
+        raw: the line as it is in the file, without its end.
     """
 
     number: int
@@ -62,6 +63,7 @@ class LogLine:
     message: bytes = b""
     key_id: str = ""
     signature: str = ""
+    raw: bytes = b""
 
     def signed_by(self, public_key: bytes) -> bool:
         """Return whether this key (32 raw bytes) made the line's signature."""
@@ -258,11 +260,21 @@ def _line(number: int, raw: bytes, previous: str) -> LogLine:
         message = _message(number, previous, checkpoint, key_id)
         written = canonical_parsed(data).encode() + b"\n"
     except (ValueError, TypeError, KeyError, RecursionError, StoreError):
-        return LogLine(number, None, "it cannot be read")
+        return LogLine(number, None, "it cannot be read", raw=raw.rstrip(b"\n"))
     problem = "" if (said_before, said_number) == (previous, number) else "it does not follow the line before it"
     if not problem and raw != written:
         problem = "it is not as it was written: its text was altered"
-    return LogLine(number, checkpoint, problem, message, key_id, signature)
+    return LogLine(number, checkpoint, problem, message, key_id, signature, raw.rstrip(b"\n"))
+
+
+def line_alone(raw: bytes) -> LogLine:
+    """Return a line that was found without those before it: what it says of its own place is taken as said."""
+    try:
+        data = json.loads(raw)
+        number, previous = int(data["number"]), str(data["previous_sha256"])
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return LogLine(0, None, "it cannot be read", raw=raw)
+    return _line(number, raw.rstrip(b"\n") + b"\n", previous)
 
 
 def _message(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> bytes:

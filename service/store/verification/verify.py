@@ -18,6 +18,7 @@ from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
 from service.store.journal.findings import journal_findings
+from service.store.objects.anchored import UnreadAnchors, read_anchors
 from service.store.objects.elsewhere import files_elsewhere
 from service.store.records import SITE, Artefact, RunRow, UnknownRunError
 from service.store.runs import read_runs
@@ -28,6 +29,14 @@ from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import postgres_checks, search_checks
 from service.store.verification import signature_checks as signatures
+from service.store.verification.anchor_checks import (
+    AnchorCounts,
+    AnchorFindings,
+    ReadAnchors,
+    Record,
+    compare,
+    not_compared,
+)
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
 from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
 from service.store.verification.file_checks import Elsewhere, Progress, elsewhere_notes, hash_files, unlisted_files
@@ -55,6 +64,8 @@ class AuditReport:
     key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first, to compare as well
     faults: tuple[Fault, ...]  # faults in the order of the chain
     notes: tuple[str, ...]
+    anchors: AnchorCounts | None = None  # compared with the object store; None if the site has no anchors there
+    not_compared: tuple[str, ...] = ()  # sentences on what could not be compared with it, which are notes as well
     not_judged: tuple[str, ...] = ()  # sentences on views whose pose cannot be compared with their joints, by run
 
     def with_limits(self) -> AuditReport:
@@ -63,8 +74,13 @@ class AuditReport:
 
     @property
     def ok(self) -> bool:
-        """True if the evidence verifies."""
+        """True if nothing differs."""
         return not self.faults
+
+    @property
+    def verified(self) -> bool:
+        """True if nothing differs, and everything that a verification compares could be compared."""
+        return self.ok and not self.not_compared
 
     @property
     def first_fault(self) -> Fault | None:
@@ -95,6 +111,7 @@ def verify(
     files: bool = True,
     signatures_copy: Path | None = None,
     stated_hashes: bool = False,
+    anchors_of: Path | None = None,
 ) -> AuditReport:
     """Check the chain, hash every file again and check every signature, of one run or of all.
 
@@ -109,6 +126,8 @@ def verify(
         files: False skips the files; a note says so.
         signatures_copy: a copy of the log of signatures from elsewhere, which shows whether the log was cut.
         stated_hashes: take the object store's own SHA-256 of files that only it has, instead of fetching them.
+        anchors_of: a folder elsewhere whose site.yaml names the object store of the anchors; None for the data
+            folder's own, which whoever forges the record can change.
 
     Raises:
         UnknownRunError: there is no such run.
@@ -116,12 +135,15 @@ def verify(
     """
     of_wal, notes_of_wal = wal_findings(data_dir)  # of SQLite; a server has no such file here
     away = files_elsewhere(data_dir, stated_hashes=stated_hashes) if files else None
+    # Before the log: a signature made meanwhile is in the log before it has an anchor.
+    anchors = read_anchors(anchors_of or data_dir)
     database = open_read_only(data_dir, DurableFiles())
     try:
         # Before the database's snapshot: a signature made meanwhile is in the database first, and then in the log.
         lines = read_log(data_dir / LOG_NAME)
         with database.reading() as connection, _damage_named(data_dir, connection):
-            report = _verify(data_dir, connection, lines, run_id, progress, certificates, away, with_files=files)
+            outside = _Outside(lines, certificates, away, anchors)
+            report = _verify(data_dir, connection, outside, run_id, progress, with_files=files)
             runs = None if run_id is None else [run_id]
             of_journal, notes_of_journal = (
                 ([], [])
@@ -156,27 +178,35 @@ def _damage_named(data_dir: Path, connection: Connection) -> Generator[None]:
         raise StoreError(damage[0], where=str(database_path(data_dir)), remedy=RESTORE) from error
 
 
+@dataclass(frozen=True, slots=True)
+class _Outside:
+    """The witnesses of a database: the log of signatures, certificates, and an object store's files and anchors."""
+
+    lines: Sequence[LogLine] | None
+    certificates: Path | None
+    away: Elsewhere | None
+    anchors: ReadAnchors | UnreadAnchors | None
+
+
 def _verify(
     data_dir: Path,
     connection: Connection,
-    lines: Sequence[LogLine] | None,
+    outside: _Outside,
     run_id: str | None,
     progress: Progress | None,
-    certificates: Path | None,
-    away: Elsewhere | None,
     *,
     with_files: bool,
 ) -> AuditReport:
     evidence = read_evidence(connection, run_id)
     folder = data_dir / "artefacts"
     artefact_rows = (row for rows in evidence.artefacts.values() for row in rows)
-    files = hash_files(folder, artefact_rows, progress, away) if with_files else None
+    files = hash_files(folder, artefact_rows, progress, outside.away) if with_files else None
     chains, found = _check_chains(connection, evidence, files)
     site = chains[SITE]
     keys = signatures.key_history(site, evidence.checkpoints[SITE])
     found[SITE] += keys.faults
     stamps_differ = tuple(signatures.stamp_faults(site, evidence.checkpoints, evidence.timestamps))
-    check = _SignatureCheck(evidence, site, keys.periods, stamps_differ, certificates)
+    check = _SignatureCheck(evidence, site, keys.periods, stamps_differ, outside.certificates)
     notes = list(keys.notes)
     for run, facts in chains.items():
         faults, said = check.findings(run, facts)
@@ -186,14 +216,16 @@ def _verify(
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
     notes += elsewhere_notes((files or {}).values())
-    of_log, said_of_log = _log_findings(lines, evidence, site, keys, run_id)
+    of_log, said_of_log = _log_findings(outside.lines, evidence, site, keys, run_id)
     every_run = run_id is None
+    anchored, unread = _anchor_findings(outside, chains, keys, evidence, every_run=every_run)
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [
         *(Fault(None, None, DATABASE_NAME, problem) for problem in evidence.damage),
         *(fault for run in ordered for fault in found[run]),
         *signatures.signed_run_faults(site, chains, every_run=every_run),
         *of_log,
+        *anchored.faults,
         *foreign,
         *_derived_faults(connection, ordered, every_run=every_run),
         *people_faults(site.people, evidence.accounts, evidence.links, evidence.sessions),
@@ -203,7 +235,9 @@ def _verify(
         counted,
         key_ids=tuple(keys.periods),
         faults=tuple(faults),
-        notes=(*notes, *said_of_log, *orphans),
+        notes=(*notes, *said_of_log, *anchored.notes, *unread, *orphans),
+        anchors=None if outside.anchors is None else anchored.counts,
+        not_compared=unread,
         not_judged=tuple(f"{run}: {said}" for run in evidence.run_ids for said in chains[run].poses.not_judged()),
     )
 
@@ -220,6 +254,26 @@ def _log_findings(
     faults, notes = log_findings(lines, evidence.checkpoints, public_keys, awaited=bool(site.key_changes))
     before, said = written_again_findings(site.written_again, run_id)
     return [*before, *faults], [*said, *notes]
+
+
+def _anchor_findings(
+    outside: _Outside,
+    chains: Mapping[str, ChainFacts],
+    keys: signatures.Keys,
+    evidence: EvidenceRows,
+    *,
+    every_run: bool,
+) -> tuple[AnchorFindings, tuple[str, ...]]:
+    """Return what the anchors in the object store show, and sentences on what could not be compared with them."""
+    anchors, lines = outside.anchors, outside.lines or []
+    if anchors is None:
+        return AnchorFindings(), ()
+    if isinstance(anchors, UnreadAnchors):
+        counts = AnchorCounts(lines_not_compared=len(lines), heads_not_compared=len(evidence.heads))
+        said = not_compared(anchors.place, anchors.why, counts.lines_not_compared, counts.heads_not_compared)
+        return AnchorFindings(counts=counts), (said,)
+    public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
+    return compare(anchors, Record(lines, chains, public_keys, every_run)), ()
 
 
 def _check_chains(

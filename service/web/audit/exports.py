@@ -125,6 +125,7 @@ def _require_verified(frame: AuditFrame) -> None:
         return
     what = {
         "faults": "the evidence does not verify",
+        "partial": "the evidence could not be compared with its anchors in the object store",
         "outdated": "the evidence has not been verified since its last event",
     }.get(frame.verified, "the evidence has not been verified yet")
     remedy = "Read the faults; nothing is released" if frame.verified == "faults" else "Verify it, then release"

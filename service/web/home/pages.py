@@ -21,12 +21,12 @@ from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAb
 from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
-from service.store.data_folder import SITE_FILE
 from service.store.disk_space import forecast_of
 from service.store.records import RunRow
 from service.web.page.rendering import render
 from service.web.page.robot_banner import robot_banner
 from service.web.page.run_frame import driven_frames, limit, run_frame, run_standing
+from service.web.page.spool import spool_sentence
 from service.web.security import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -94,7 +94,7 @@ def home(
     return render(
         request,
         "home/home.html.j2",
-        uploading=_uploading(site),
+        uploading=spool_sentence(site),
         under_way=[line for line in lines if line.status in ("active", "paused")],
         ended=[line for line in lines if line.status not in ("active", "paused")],
         found=found,
@@ -140,19 +140,6 @@ def _in_order(site: Site, found: Collection[str]) -> list[RunRow]:
     under_way = site.store.open_runs() | driven
     newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]
     return sorted(newest_first, key=lambda row: (row.run_id not in driven, row.run_id not in under_way))
-
-
-def _uploading(site: Site) -> str:
-    """Say what waits for the site's object store, and what hinders it; "" without a store."""
-    if not (site.data / SITE_FILE).is_file():
-        return ""
-    from service.store.objects.upload import upload_state  # noqa: PLC0415 - for sites only
-
-    try:
-        state = upload_state(site.store)
-    except OrthocaptureError as error:
-        return f"nothing is uploaded: {error}"
-    return "" if state is None else state.sentence
 
 
 def _unreadable(row: RunRow, fault: str) -> RunLine:

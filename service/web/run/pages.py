@@ -37,6 +37,7 @@ from service.store.disk_space import forecast_of
 from service.store.durable_effects import utc_text
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import coats_of, run_frame
+from service.web.page.spool import spool_of
 from service.web.record.images import rig_cameras
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
@@ -243,6 +244,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         to_come=[left.text for left in results_to_come(log)],
         computing=open_jobs(log),
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
+        spool=None if log.state.terminal else spool_of(site),
         earlier={} if log.state.terminal else site.step_times(run_id),
         now_utc=now_utc,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from service.core.clocks import clock_readings
 from service.core.disk_space import Forecast
@@ -55,6 +56,9 @@ from service.web.run.view_records import (
     readings,
 )
 
+if TYPE_CHECKING:
+    from service.store.objects.spool import SpoolLevel
+
 NOT_MEASURED: EarlierTimes = {}
 
 
@@ -68,6 +72,7 @@ def run_view(
     to_come: Sequence[str] = (),
     computing: Sequence[OpenJob] = (),
     space: Forecast | None = None,
+    spool: SpoolLevel | None = None,
     earlier: EarlierTimes = NOT_MEASURED,
     now_utc: str = "",
 ) -> RunView:
@@ -82,6 +87,7 @@ def run_view(
         to_come: texts on what is still being computed.
         computing: the jobs that wait or are computed, which a person may end.
         space: forecast of what the run will still write; None if it is not known.
+        spool: how full the spool is before an object store; None for a site without one.
         earlier: the times that the steps took in earlier runs.
         now_utc: the time of the page; "" where none is to be compared with it.
     """
@@ -108,7 +114,7 @@ def run_view(
         question=_question(log, snapshot, decision, mode, may_operate=viewer.may_operate),
         viewer=viewer,
         progress=capture_progress(protocol, state, log.events),
-        readings=readings(snapshot, space, clock_readings(log.events)),
+        readings=readings(snapshot, space, clock_readings(log.events), spool),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
         takes=_takes(protocol, state, earlier, now_utc),
         work_left=run_words(protocol, state, earlier, now_utc) if now_utc else "",

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
+from typing import TYPE_CHECKING
 from typing import Protocol as Interface
 
 from service.computations.evaluate import Row
@@ -18,10 +19,14 @@ from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import Event, GateVerdict, OperatorAction, OperatorVerb, RecordedView, SessionStarted
 from service.core.run.expected import duration
 from service.core.run.state import Deviation, RunState, StepState
+from service.core.text.words import counted, time_here
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
 from service.steps.images_taken import images_taken
 from service.web.page.run_frame import gate_word, limit
+
+if TYPE_CHECKING:
+    from service.store.objects.spool import SpoolLevel
 
 _GIB = 2.0**30
 _BAR_LIMIT = 75.0  # where along a bar its limit stands, in %
@@ -131,7 +136,10 @@ def _left(each_s: float | None, views: int) -> str:
 
 
 def readings(
-    snapshot: Snapshot, space: Forecast | None = None, clocks: Sequence[ClockReading] = ()
+    snapshot: Snapshot,
+    space: Forecast | None = None,
+    clocks: Sequence[ClockReading] = (),
+    spool: SpoolLevel | None = None,
 ) -> tuple[Reading, ...]:
     """Return what the runner last reported of machine and devices; what it did not report is shown as unknown.
 
@@ -139,10 +147,12 @@ def readings(
         snapshot: the runner's snapshot.
         space: forecast of what the run will still write, where it is known.
         clocks: the clocks as last compared; those beyond their limits are shown.
+        spool: how full the spool is before an object store; None for a site without one.
     """
     battery = snapshot.camera_battery_fraction
     return (
         _space("Disk", snapshot.disk_free_bytes, low_gib=20, out_gib=5) if space is None else _disk(space),
+        *([] if spool is None else [_spool(spool)]),
         _space("Camera card", snapshot.camera_free_bytes, low_gib=8, out_gib=2),
         Reading("Battery", "unknown")
         if battery is None
@@ -166,6 +176,18 @@ def _disk(space: Forecast) -> Reading:
     to_come = f"{size_words(space.needed_bytes)} to come" if space.needed_bytes > 1e6 else ""
     note = {"enough": to_come, "short": f"will not do, {to_come}", "stop": "full: make room"}[space.verdict]
     return Reading("Disk", f"{size_words(space.free_bytes)} free", tone, note)
+
+
+def _spool(level: SpoolLevel) -> Reading:
+    waiting = level.waiting
+    if not waiting.files:
+        return Reading("Object store", "has all files")
+    value = f"{counted(waiting.files, 'file')} to send, {size_words(waiting.size_bytes)}"
+    since = f"since {time_here(waiting.since_utc)}"
+    lasts = f", disk lasts {level.lasts_hours:.1f} h" if level.lasts_hours and level.lasts_hours < 1000 else ""
+    if level.trouble is None:
+        return Reading("Object store", value, "", f"{since}{lasts}")
+    return Reading("Object store", value, "attention", f"{since}: {level.trouble.what}{lasts}")
 
 
 def _space(name: str, free_bytes: int | None, *, low_gib: float, out_gib: float) -> Reading:

@@ -105,7 +105,9 @@ class Weed:
         self.bucket(name, lock=True)
         return self.objects(name, "site/a")
 
-    def write_site(self, data: Path, **spool: float) -> S3Objects:
+    def write_site(
+        self, data: Path, *, bucket: str = "ready", lock_days: int | None = None, **spool: float
+    ) -> S3Objects:
         """Write a site.yaml and its keys into a data folder, for a new prefix; returns the adapter to it."""
         prefix = f"site/{secrets.token_hex(6)}"
         data.mkdir(exist_ok=True, parents=True)
@@ -114,9 +116,10 @@ class Weed:
         keys.write_text(
             yaml.safe_dump({"access_key_id": KEYS.access_key_id, "secret_access_key": KEYS.secret_access_key})
         )
-        section = {"url": f"s3://ready/{prefix}", "endpoint": self.endpoint, "keys": keys.name}
+        section: dict[str, object] = {"url": f"s3://{bucket}/{prefix}", "endpoint": self.endpoint, "keys": keys.name}
+        section |= {} if lock_days is None else {"lock_days": lock_days}
         (data / "site.yaml").write_text(yaml.safe_dump({"object_store": section, "spool": spool}))
-        return self.objects("ready", prefix)
+        return self.objects(bucket, prefix)
 
     def kill(self) -> None:
         """End the process at once (SIGKILL); nothing of it remains but its files."""
