@@ -110,7 +110,7 @@ def export_command(
             funders=tuple(funder or ()),
         )
         wanted = WantedExport(form, crop, crops, anonymous, stated, data_version)
-        who = acting_person(store, operator, password_stdin=password_stdin)
+        who = acting_person(store, operator, "export", password_stdin=password_stdin)
         with progress_bar(quiet=json) as progress:
             dataset = export_data_set(store, run_id, wanted, target, who.name, progress)
     if json:

@@ -363,6 +363,7 @@ RUN_ELSEWHERE = {
     ),
     **dict.fromkeys(
         (
+            "orthocapture audit report latest --pdf report.pdf --data runs --operator sam",
             "orthocapture doctor --rig rig/rig.yaml",
             'orthocapture run exvivo_spine --rig rig/rig.yaml --data runs --operator "A. Name" --specimen "Spine 7"',
         ),

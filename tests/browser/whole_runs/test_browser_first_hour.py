@@ -22,7 +22,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
-from tests.support.pages.browser import Screen, fill_secrets, screen
+from tests.support.pages.browser import PASSWORD, Screen, fill_secrets, screen
 from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, RIG_LOCK
@@ -32,6 +32,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(5400)]
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _ROW = re.compile(r"^\| .* \| `(orthocapture [^`]+)` \|$", re.MULTILINE)
 _ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
+_PEOPLE = {"tina": "technician", "sam": "supervisor"}
 STEP_S = 900  # after which a step, of minutes on a quiet machine, does not end any more
 
 
@@ -55,10 +56,13 @@ class Shell:
         self._shown = ""
         os.write(self._master, line.encode() + b"\n")
 
-    def run(self, line: str, *, within_s: float = 600) -> tuple[int, str]:
-        """Type a command, wait for its end, and return its exit status and what it showed."""
+    def run(self, line: str, *, password: str = "", within_s: float = 600) -> tuple[int, str]:
+        """Type a command, and the password if one is given; return its exit status and what it showed."""
         self._count += 1
         self.type(f"{line}; echo status-$?-{self._count}.")
+        if password:
+            self.wait_for("Password of")
+            os.write(self._master, password.encode() + b"\n")
         found = self.wait_for(rf"status-(\d+)-{self._count}\.", within_s=within_s)
         return int(found[1]), self._shown
 
@@ -143,7 +147,7 @@ def test_the_tutorial_and_the_readme_lead_to_a_verified_run(
 
     work.type(activate)
     for line in after:
-        status, shown = work.run(line)
+        status, shown = work.run(line, password=PASSWORD if "--operator" in line else "")
         assert status == 0, shown
     assert (clone / "report.pdf").read_bytes().startswith(b"%PDF")
 
@@ -174,17 +178,15 @@ def _complete_a_run(browser: Browser, url: str, set_up: str) -> str:
         fill_secrets(page)
         page.get_by_role("button", name="Set up the account").click()
         tablet.sign_in("ada")
-        tablet.go("/accounts")
-        page.get_by_label("Name, as records and signatures show it").fill("Tina Example")
-        page.get_by_label("Account, to sign in with").fill("tina")
-        page.get_by_role("combobox", name="Role").select_option("technician")
-        page.get_by_role("button", name="Make a one-time link").click()
-        link = page.locator(".once").inner_text()
+        links = {account: _invite(tablet, account, role) for account, role in _PEOPLE.items()}
+    for link in links.values():
+        with screen(browser, url) as own:
+            own.page.goto(link)
+            fill_secrets(own.page)
+            own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
+            expect(own.page.get_by_text("The account is ready")).to_be_visible()
     with screen(browser, url) as tablet:
         page = tablet.page
-        page.goto(link)
-        fill_secrets(page)
-        page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
         tablet.sign_in("tina")
         tablet.go("/")
         page.get_by_role("button", name="Start Demonstration on a simulated rig").click()
@@ -194,6 +196,17 @@ def _complete_a_run(browser: Browser, url: str, set_up: str) -> str:
         run = page.url.rpartition("/")[2]
         _do_what_is_asked(tablet)
         return run
+
+
+def _invite(tablet: Screen, account: str, role: str) -> str:
+    """Invite a person on the page Accounts, and return the one-time link."""
+    tablet.go("/accounts")
+    page = tablet.page
+    page.get_by_label("Name, as records and signatures show it").fill(f"{account.title()} Example")
+    page.get_by_label("Account, to sign in with").fill(account)
+    page.get_by_role("combobox", name="Role").select_option(role)
+    page.get_by_role("button", name="Make a one-time link").click()
+    return page.locator(".once").inner_text()
 
 
 def _do_what_is_asked(tablet: Screen) -> None:
@@ -217,14 +230,17 @@ def _type_the_table(work: Shell, run: str) -> None:
     assert "simulate rig" in simulate
     assert " serve " in serve
     for command in (doctor, check, *readers):
-        status, shown = work.run(command)
+        acts = " audit report " in command or " export " in command
+        status, shown = work.run(f"{command} --operator sam" if acts else command, password=PASSWORD if acts else "")
         assert status == 0, f"{command}: {shown}"
         assert run in shown or "latest" not in command, f"{command} does not name the run: {shown}"
-    work.type(begin)
-    work.wait_for(r"Type one of: confirm")
-    work.interrupt()
-    work.wait_for(r"orthocapture resume")  # how to go on
-    work.type(resume)
-    work.wait_for(r"Type one of: confirm")
+    for command in (begin, resume):  # the name that stands there is that of a site without accounts
+        work.type(f"{command} --operator tina")
+        work.wait_for("Password of")
+        work.type(PASSWORD)
+        work.wait_for(r"Type one of: confirm")
+        if command == begin:
+            work.interrupt()
+            work.wait_for(r"orthocapture resume")  # how to go on
     work.type("abort only reading the README")
     work.wait_for(r"is aborted")
