@@ -8,7 +8,6 @@ import typer
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.options import OperatorOption, PasswordOption, acting_person
-from service.people.person import NotAllowedError
 from service.people.rows import plain_name
 from service.people.sessions import People
 from service.store.records import SITE
@@ -33,11 +32,7 @@ def end_wait_command(
 ) -> None:
     """End all waits after wrong passwords of an account, as its page does. Only an administrator may."""
     with reporting_errors(json), Store.open(data, create=False) as store:
-        who = acting_person(store, operator, password_stdin=password_stdin)
-        if who.role != "administrator":
-            raise NotAllowedError(
-                f"{who.name} is no administrator", where="role", remedy="Give the account of one with --operator"
-            )
+        who = acting_person(store, operator, "administer", password_stdin=password_stdin)
         name = plain_name(account)
         People(store).accounts.end_wait(who.name, name)
         checkpoint(store, SITE)

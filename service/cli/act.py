@@ -64,7 +64,7 @@ def act_command(
         name = operator or getpass.getuser()
         password = partial(typed_password, name, from_stdin=password_stdin)
         if verb in _OF_A_CAPTURE:
-            name = who_acts(People(store), name, password).name
+            name = who_acts(People(store), name, password, "operate").name
             asked = CaptureAsked.model_validate(
                 {"step": step or state.current, "attempt": state.step.attempt, "what": verb}
             )
@@ -72,7 +72,7 @@ def act_command(
             _report_recorded(run_id, verb, asked.step, name, json=json)
             return
         if verb in _BESIDE_THE_QUESTION:
-            name = who_acts(People(store), name, password).name
+            name = who_acts(People(store), name, password, "operate").name
             log = read_log(store, run_id, protocol)
             about = _see(log, device, name) if verb == "seen" else _tick(log, item, name, ticked=verb == "tick")
             _report_recorded(run_id, verb, about, name, json=json)
@@ -105,7 +105,7 @@ def _identity(
     identity = identity_for(People(store), protocol, state, verb, name, password)
     if identity is None and verb == "pause":
         return who_pauses(People(store), name)
-    return identity or who_acts(People(store), name, password)
+    return identity or who_acts(People(store), name, password, "sign" if verb == "sign" else "operate")
 
 
 def _ask_capture(
@@ -176,7 +176,7 @@ def note_command(
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
         photograph = None if photo is None else _photograph(photo)
-        name = acting_person(store, operator, password_stdin=password_stdin).name
+        name = acting_person(store, operator, "operate", password_stdin=password_stdin).name
         log = read_log(store, run_id, protocol)
         event = take_note(log, text, photograph, step=step, actor=name, via="cli")
         _report_recorded(run_id, "note", step or log.state.current, name, json=json, seq=event.seq)
@@ -213,7 +213,7 @@ def draw_region_command(
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
-        name = acting_person(store, operator, password_stdin=password_stdin).name
+        name = acting_person(store, operator, "operate", password_stdin=password_stdin).name
         region = read_region(step_to_draw_for(read_log(store, run_id, protocol)), source, corners, along)
         (event,) = store.record(run_id, [region], actor=name)
         _report_recorded(run_id, "region", region.step, name, json=json, seq=event.seq)
@@ -232,7 +232,7 @@ def cancel_command(
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         chosen = _open_job(store, run_id, job)
-        name = acting_person(store, operator, password_stdin=password_stdin).name
+        name = acting_person(store, operator, "operate", password_stdin=password_stdin).name
         event = cancel_computation(store, run_id, chosen.job_id, reason, actor=name)
         if json:
             print_json({"run": run_id, "cancelled": chosen.job_id, "event": event.seq})

@@ -41,7 +41,6 @@ from service.core.text.words import counted
 from service.core.units import megabytes
 from service.followed_run import read_log
 from service.people.authorisation import Identity
-from service.people.person import ROLES, NotAllowedError, Permission, may
 from service.run_acts import release_run, require_releasable
 from service.run_start import recorded_run
 from service.store.access import kept_to
@@ -76,8 +75,7 @@ def release_command(
         meaning, signed = release_meaning(log.state), log.state.completed_sha256
         who = Identity("", "", "claimed")
         if yes:
-            who = acting_person(store, operator, password_stdin=password_stdin)
-            _require(who, "release")
+            who = acting_person(store, operator, "release", password_stdin=password_stdin)
             require_releasable(log.state, who.name, meaning, signed)
             _require_verified(store, run_id, quiet=json)
             identified = "claimed" if who.identified == "claimed" else "password"
@@ -106,22 +104,12 @@ def correct_command(
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
-        who = acting_person(store, operator, password_stdin=password_stdin)
-        _require(who, "correct")
+        who = acting_person(store, operator, "correct", password_stdin=password_stdin)
         made = correct(store, run_id, of_seq=event, field=field, new=value, reason=reason, actor=who.name)
     if json:
         print_json({"run": run_id, "event": made.seq, "of_event": event, "field": field})
     else:
         console.print(f"Recorded as event {made.seq}: {field} of event {event} is {value}")
-
-
-def _require(who: Identity, permission: Permission) -> None:
-    """Raise NotAllowedError if the person's role does not permit it; a mere claim means a site without accounts."""
-    if who.identified == "claimed":
-        return
-    if not any(role == who.role and may(role, permission) for role in ROLES):
-        roles = " or ".join(role for role in ROLES if may(role, permission))
-        raise NotAllowedError(f"{who.name} may not do this", where=permission, remedy=f"Call a {roles}")
 
 
 def _require_verified(store: Store, run_id: str, *, quiet: bool) -> None:
@@ -278,7 +266,7 @@ def rotate_key_command(
 ) -> None:
     """Replace the signing key. The old key signs the new one, and then its file is destroyed."""
     with reporting_errors(json), Store.open(data, create=False) as store:
-        who = acting_person(store, operator, password_stdin=password_stdin)
+        who = acting_person(store, operator, "administer", password_stdin=password_stdin)
         key = rotate_key(store, reason=reason, actor=who.name, lost=lost)
     if json:
         print_json(_key_json(key))
@@ -310,7 +298,7 @@ def export_command(
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         require_writable(bundle)
-        who = acting_person(store, operator, password_stdin=password_stdin)
+        who = acting_person(store, operator, "report", password_stdin=password_stdin)
         with progress_bar(quiet=json) as report_progress:
             made = export_bundle(
                 store,

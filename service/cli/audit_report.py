@@ -106,7 +106,7 @@ def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
     Raises ConfigurationError, SignInRefusedError.
     """
     with Store.open(data, create=False) as store:
-        return acting_person(store, operator, password_stdin=password_stdin).name
+        return acting_person(store, operator, "report", password_stdin=password_stdin).name
 
 
 def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str], None] | None) -> None:

@@ -125,7 +125,7 @@ def export_command(
             funders=tuple(funder or ()),
         )
         wanted = WantedExport(form, crop, crops, anonymous, stated, data_version)
-        who = acting_person(store, operator, password_stdin=password_stdin)
+        who = acting_person(store, operator, "export", password_stdin=password_stdin)
         cluster = reached_scheduler(
             scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key, patience_s=scheduler_patience
         )

@@ -141,7 +141,7 @@ def import_command(
             return
         rig = import_rig(listing, simulated=simulated, ct=reading)
         with Store.open(data) as store:
-            who = acting_person(store, operator, password_stdin=password_stdin)
+            who = acting_person(store, operator, "operate", password_stdin=password_stdin)
             run_id = _run_of(store, loaded, rig, operator=who.name, again=again, about=about)
             state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker, who=who)
             summary = summarise(store, run_id, loaded.protocol)

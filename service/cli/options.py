@@ -13,6 +13,7 @@ from service.core.errors import ConfigurationError
 from service.core.records.entered import RunAbout, about_run, require_specimen
 from service.core.shown_text import shown
 from service.people.authorisation import Identity, who_acts
+from service.people.person import Permission
 from service.people.sessions import People
 from service.store.store import Store
 
@@ -22,13 +23,18 @@ PasswordOption = Annotated[
 ]
 
 
-def acting_person(store: Store, operator: str, *, password_stdin: bool) -> Identity:
+def acting_person(store: Store, operator: str, permission: Permission, *, password_stdin: bool) -> Identity:
     """Return the person who acts at this terminal: the given name, or that of the machine's user.
 
-    The name of an account needs its password. Raises ConfigurationError, SignInRefusedError.
+    The name of an account needs its password, and its role must have the permission.
+
+    Raises:
+        ConfigurationError: no password was given.
+        NotAllowedError: nobody has this name, or the person's role does not permit this.
+        SignInRefusedError: name and password do not belong together.
     """
     name = operator or getpass.getuser()
-    return who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
+    return who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin), permission)
 
 
 def typed_password(name: str, *, from_stdin: bool) -> str:

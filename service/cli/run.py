@@ -251,7 +251,7 @@ def run_command(
         else:
             about = described(specimen, purpose=purpose, site=site, remarks=remarks)
         with Store.open(data) as store:
-            who = acting_person(store, operator, password_stdin=password_stdin)
+            who = acting_person(store, operator, "operate", password_stdin=password_stdin)
             if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
@@ -279,7 +279,7 @@ def resume_command(
         rig = recorded_rig(store, root)
         who = None
         if not (auto_confirm or screens):
-            who = acting_person(store, operator or root.operator, password_stdin=password_stdin)
+            who = acting_person(store, operator or root.operator, "operate", password_stdin=password_stdin)
         with _waiting_run_named(run_id):
             state = drive(
                 store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens, who=who

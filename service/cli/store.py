@@ -80,7 +80,7 @@ def restore_command(
 
     def actor(folder: Path) -> str:
         with Store.open(folder, create=False) as store:
-            return acting_person(store, operator, password_stdin=password_stdin).name
+            return acting_person(store, operator, "read", password_stdin=password_stdin).name
 
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         require_writable_folder(destination)
@@ -176,7 +176,7 @@ def rebuild_command(
 
     def actor(folder: Path) -> str:
         with Store.open(folder, create=False) as store:
-            return acting_person(store, operator, password_stdin=password_stdin).name
+            return acting_person(store, operator, "read", password_stdin=password_stdin).name
 
     with reporting_errors(json):
         made = rebuild(data, actor=actor, journal=journal)
@@ -254,7 +254,7 @@ def copy_command(
 
     def actor(folder: Path) -> str:
         with Store.open(folder, create=False) as store:
-            return acting_person(store, operator, password_stdin=password_stdin).name
+            return acting_person(store, operator, "read", password_stdin=password_stdin).name
 
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         made = copy_record(source, target, actor=actor, progress=progress)
@@ -297,7 +297,7 @@ def gc_command(
         age_s = 60 * min_age_min
         gone = []
         if remove:
-            who = acting_person(opened, operator, password_stdin=password_stdin)
+            who = acting_person(opened, operator, "read", password_stdin=password_stdin)
             gone = remove_leftovers(opened, actor=who.name, min_age_s=age_s)
             if gone:
                 checkpoint(opened, SITE)

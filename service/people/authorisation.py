@@ -11,7 +11,7 @@ from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.core.text.person_names import cleaned_name, person_name
-from service.people.person import NotAllowedError
+from service.people.person import ROLES, NotAllowedError, Permission, may
 from service.people.rows import plain_name
 from service.people.sessions import KnownBy, People
 from service.people.tries import TERMINAL, SecretOrigin
@@ -46,11 +46,18 @@ def identity_for(
     return identify(people, typed, role, secret, known_by, origin) if role else None
 
 
-def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
+def who_acts(people: People, typed: str, password: Callable[[], str], permission: Permission) -> Identity:
     """Return the person who acts on the command line: by password where there are accounts, else by claim.
 
+    Args:
+        people: accounts of the data folder.
+        typed: the name as typed.
+        password: asks for the password; not called on a site without accounts.
+        permission: what the person does. Their role must permit it, as it must on the pages.
+
     Raises:
-        NotAllowedError: there are accounts, and none has this name; or there are none, and this is no person's name.
+        NotAllowedError: there are accounts, and none has this name, or its role does not permit this; or there are
+            none, and this is no person's name.
         SignInRefusedError: name and password do not belong together, or the account is not in use.
     """
     accounts = {account.account: account.role for account in people.accounts.all()}
@@ -64,7 +71,13 @@ def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identit
             remedy="Give the name of your account with --operator; an administrator makes one on the page Accounts",
         )
     people.check_password(name, password())
-    return Identity(name, accounts[name], "password")
+    role = accounts[name]
+    permitted = [each for each in ROLES if may(each, permission)]
+    if role not in permitted:
+        raise NotAllowedError(
+            f"{name} is {role} and may not do this", where=permission, remedy=f"Call a {' or '.join(permitted)}"
+        )
+    return Identity(name, role, "password")
 
 
 def who_pauses(people: People, typed: str) -> Identity:

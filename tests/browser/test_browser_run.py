@@ -24,6 +24,7 @@ from tests.support.pages.browser import (
     Screen,
     Served,
     accessibility_faults,
+    fill_secrets,
     follow,
     invite_people,
     screen,
@@ -82,13 +83,6 @@ def people(server: Served, browser: Browser) -> None:
             # The link works only once.
             assert own.page.goto(link).status in (404, 409, 410)  # type: ignore[union-attr]
     invite_people(server.data, (("tom", "technician"), ("sam", "supervisor"), ("otto", "auditor")))
-
-
-def fill_secrets(page: Page) -> None:
-    passwords = page.locator("input[type=password]:visible")
-    for i in range(passwords.count()):
-        is_pin = "pin" in (passwords.nth(i).get_attribute("name") or "")
-        passwords.nth(i).fill(PIN if is_pin else PASSWORD)
 
 
 def start(tablet: Screen) -> str:

@@ -63,10 +63,10 @@ def test_nothing_is_recorded_in_the_name_of_an_account_without_its_password(
 
 def test_with_the_password_it_is_recorded(data: Path, tmp_path: Path) -> None:
     words = ["audit", "export", "latest", str(tmp_path / "b.zip"), "--hashes-only"]
-    status, said = called(data, "Grace", *words, typed=password_of("grace"))
+    status, said = called(data, "Lise", *words, typed=password_of("lise"))
     assert status == 0, said
     assert Path(json.loads(said)["path"]).exists()
-    assert recorded_by(data, "grace")[-1] == "evidence_exported"
+    assert recorded_by(data, "lise")[-1] == "evidence_exported"
 
 
 @pytest.mark.slow

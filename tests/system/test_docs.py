@@ -364,6 +364,15 @@ RUN_ELSEWHERE = {
     "orthocapture store copy site-folder archive": (
         "tests/store/test_postgres.py::test_a_record_goes_to_postgresql_and_back_with_every_number_the_same"
     ),
+    **dict.fromkeys(
+        (
+            "orthocapture audit report latest --pdf report.pdf --data runs --operator sam",
+            "orthocapture doctor --rig rig/rig.yaml",
+            'orthocapture run exvivo_spine --rig rig/rig.yaml --data runs --operator "A. Name" --specimen "Spine 7"',
+        ),
+        "tests/browser/whole_runs/test_browser_first_hour.py::"
+        "test_the_tutorial_and_the_readme_lead_to_a_verified_run",
+    ),
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),

@@ -202,6 +202,14 @@ def invite_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
         desk.sign_out(administrator)
 
 
+def fill_secrets(page: Page) -> None:
+    """Fill in the new password and the PIN wherever the page asks for one."""
+    passwords = page.locator("input[type=password]:visible")
+    for i in range(passwords.count()):
+        is_pin = "pin" in (passwords.nth(i).get_attribute("name") or "")
+        passwords.nth(i).fill(PIN if is_pin else PASSWORD)
+
+
 @dataclass
 class Screen:
     """A tablet or a desktop with one person in front of it."""

@@ -46,7 +46,7 @@ NAMES: dict[Role, str] = {
     "auditor": "Lise Meitner",
     "administrator": "Ada Lovelace",
 }
-_ACCOUNTS: dict[Role, str] = {role: name.split()[0].lower() for role, name in NAMES.items()}
+ACCOUNT_OF: dict[Role, str] = {role: name.split()[0].lower() for role, name in NAMES.items()}
 
 
 def password_of(account: str) -> str:
@@ -126,14 +126,14 @@ class WebSite:
         browser.portal = self.portal  # without it every request would start a loop and a thread of its own
         self.browsers.append(browser)
         if role is not None:
-            account = _ACCOUNTS[role]
+            account = ACCOUNT_OF[role]
             token = self.people.sign_in(account, password_of(account), address="testclient")
             browser.cookies.set(cookie_name(self.site), token, domain="testserver.local", path="/")
         return browser
 
     def account(self, role: Role) -> str:
         """The account that has the role."""
-        return _ACCOUNTS[role]
+        return ACCOUNT_OF[role]
 
     def begin_run(self, protocol: str = PROTOCOL) -> Bench:
         """Begin a run, which waits for its first confirmation."""
@@ -203,12 +203,12 @@ def populate(people: People) -> None:
     first = people.first_link()
     if first is None:
         return
-    name = _ACCOUNTS["administrator"]
+    name = ACCOUNT_OF["administrator"]
     people.accounts.set_up(first, name, NAMES["administrator"], password_of(name), PIN)
     by = people.person(people.sign_in(name, password_of(name)), idle_lock_s=1e9, deliberate=False)
     assert by is not None
     for role in ROLES:
         if role != "administrator":
-            account = _ACCOUNTS[role]
+            account = ACCOUNT_OF[role]
             people.accounts.accept(people.accounts.invite(by, account, NAMES[role], role), password_of(account), PIN)
     people.sign_out(by)
