@@ -46,7 +46,7 @@ def give_producer(rig: Path, producer: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "way",
-    [pytest.param("Aravis", marks=pytest.mark.whole), "harvesters", pytest.param("OpenCV", marks=pytest.mark.whole)],
+    [pytest.param(by, marks=pytest.mark.whole) for by in ("Aravis", "harvesters", "OpenCV")],
 )
 def test_doctor_and_a_whole_small_run(way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(ADDRESS_VARIABLE, HOST)
