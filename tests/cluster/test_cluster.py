@@ -24,7 +24,13 @@ from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.records.events import JobFailed, JobFinished
-from service.machine.executors import computing_at, mapping, noting_places
+from service.machine.executors import (
+    VARIABLE,
+    computing_as_environment_says,
+    computing_at,
+    mapping,
+    noting_places,
+)
 from service.machine.remote_task import compute_there, remote_task
 from service.machine.schedulers import GROUP, RemoteExecutors, Scheduler
 from service.store.records import NewJob
@@ -306,6 +312,11 @@ def test_any_executor_can_be_plugged_in(tmp_path: Path, monkeypatch: pytest.Monk
     with computing_at(Scheduler("threads://3")), noting_places() as places, mapping(1, 5) as map_over:
         assert list(map_over(tasks.square, range(5))) == [0, 1, 4, 9, 16]
     assert sum(places.values()) == 5
+    for address, elsewhere in (("threads://2", 4), ("", 0)):
+        monkeypatch.setenv(VARIABLE, address)
+        with computing_as_environment_says(), noting_places() as places, mapping(1, 4) as map_over:
+            assert list(map_over(tasks.square, range(4))) == [0, 1, 4, 9]
+        assert sum(places.values()) == elsewhere
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from service.audit.export.exports import FORMAT
 from service.audit.export.wanted import forget_request, kept_request
 from service.core.errors import ConfigurationError
 from service.machine.executors import computing_as_environment_says
+from service.machine.resources import compute_in_background
 from service.store.artefacts import chunks_of
 from service.store.disk_space import require_export_space
 from service.store.store import Store
@@ -116,4 +117,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    compute_in_background()  # it may use all processors; a capture and its worker need them more
     main(sys.argv[1:])
