@@ -190,8 +190,8 @@ def verify_command(
 ) -> None:
     """Verify the evidence: hash every file again, follow the chain, check the signatures, and name the first fault.
 
-    The exit status is 0 if everything is as it was recorded, and 1 if anything differs or could not be compared with
-    its anchors in the object store.
+    The exit status is 0 if everything is as it was recorded, and 1 if anything differs or could not be compared, as
+    while the object store is away.
     """
     with reporting_errors(json):
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
@@ -333,7 +333,9 @@ def report_json(report: AuditReport) -> dict[str, Any]:
     fields = asdict(report)
     del fields["not_judged"]  # among the notes
     if report.anchors is None:
-        del fields["anchors"], fields["not_compared"]
+        del fields["anchors"]
+    if report.anchors is None and not report.not_compared:
+        del fields["not_compared"]
     return {"ok": report.ok, "first_fault": first, **fields}
 
 
@@ -397,7 +399,7 @@ def _print_report(report: AuditReport) -> None:
     for note in report.notes:
         console.tell(("  note:", "yellow"), f" {note}")
     if report.ok and report.not_compared:
-        console.tell(("NOT verified as a whole.", "bold yellow"), " Nothing differs, but anchors were not compared.")
+        console.tell(("NOT verified as a whole.", "bold yellow"), " Nothing differs, but not all could be compared.")
         return
     if report.first_fault is None:
         console.tell(("Verified:", "bold green"), " everything is as it was recorded.")

@@ -323,13 +323,15 @@ def test_a_line_that_is_older_than_the_lock_needs_no_anchor(site: Site) -> None:
     assert isinstance(anchors, ReadAnchors)
     assert lines is not None
     later = replace(anchors, at=anchors.at + timedelta(days=LOCKED_DAYS, hours=1), patience=timedelta())
-    found = compare(later, Record(lines, {}, {}, every_run=False))
-    assert any("no anchor any more, up to line" in note for note in found.notes)
-    assert not any("has no anchor in the object store" in fault.what for fault in found.faults)
-    sooner = replace(later, at=anchors.at + timedelta(hours=1))
-    assert any(
-        "has no anchor" in fault.what for fault in compare(sooner, Record(lines, {}, {}, every_run=False)).faults
-    )
+    record = Record(lines, {}, {}, every_run=False)
+    assert any("no anchor any more, up to line" in note for note in compare(later, record).notes)
+
+    def unanchored(at: datetime) -> bool:
+        return any("has no anchor" in fault.what for fault in compare(replace(later, at=at), record).faults)
+
+    assert not unanchored(later.at)
+    assert unanchored(anchors.at + timedelta(hours=1))
+    assert not unanchored(anchors.at - timedelta(hours=1)), "it was signed after the anchors were read"
 
 
 def test_a_bucket_without_lock_is_refused_and_keeps_no_file_waiting(weed: Weed, tmp_path: Path) -> None:

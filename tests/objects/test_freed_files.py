@@ -91,6 +91,13 @@ def test_what_the_store_holds_otherwise_or_not_at_all_is_refused(weed: Weed, tmp
         (tmp_path / "data" / "site.yaml").write_text(yaml.safe_dump(site))
     with Store.open(tmp_path / "data") as store, pytest.raises(IntegrityError, match="does not answer"):
         store.artefact_path(away)
+    unread = verify(tmp_path / "data")
+    assert unread.ok, "nobody can say that they are missing"
+    assert not unread.verified
+    assert "files are not here and are not compared, because their object store is away" in unread.not_compared[0]
+    said = CliRunner().invoke(app, ["audit", "verify", "all", "--data", str(tmp_path / "data")])
+    assert said.exit_code == 1
+    assert "NOT verified as a whole" in said.output
 
 
 def test_only_what_is_confirmed_old_and_of_ended_runs_is_freed(weed: Weed, tmp_path: Path) -> None:

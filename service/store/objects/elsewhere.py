@@ -8,7 +8,7 @@ from pathlib import Path
 
 from service.store.artefacts import Meter
 from service.store.data_folder import object_store_of
-from service.store.objects.interface import ObjectStore, ObjectStoreError
+from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
 from service.store.verification.chain_checks import FileState
 
 _MISSING = "the file is missing"
@@ -40,6 +40,8 @@ class FilesElsewhere:
             meter = Meter(objects.chunks(sha256))
             for _ in meter:
                 pass
+        except ObjectStoreAwayError as error:
+            return FileState(shown, "", 0, error.what, "away")
         except ObjectStoreError as error:
             return FileState(shown, "", 0, f"{_MISSING} here, and {error.what}", "fetched")
         return FileState(named, meter.sha256, meter.size, "", "fetched")

@@ -53,14 +53,15 @@ class Fault:
 class FileState:
     """The result of checking a recorded file again; `problem` is "" if it could be read.
 
-    `how` says what was hashed: the file in this folder, what the object store sent, or nothing (its own statement).
+    `how` says what was hashed: the file in this folder, what the object store sent, or nothing: its own statement, or
+    the store is away, and nobody can say now what it holds.
     """
 
     shown: str
     sha256: str
     size: int
     problem: str
-    how: Literal["here", "fetched", "stated"] = "here"
+    how: Literal["here", "fetched", "stated", "away"] = "here"
 
 
 @dataclass
@@ -252,7 +253,7 @@ def _artefact_faults(
             yield Fault(run_id, seq, shown, "the artefact's row is not what the event refers to")
         elif record_sha256(event["sha256"], dict(row)) != row["record_sha256"]:
             yield Fault(run_id, seq, shown, "the artefact's row was altered (device, step, time, who …)")
-        if state is None:
+        if state is None or state.how == "away":
             continue
         if state.problem:
             yield Fault(run_id, seq, state.shown, f"{state.problem} ({row['original_name']})")

@@ -73,6 +73,18 @@ def elsewhere_notes(states: Iterable[FileState]) -> list[str]:
     return notes
 
 
+def unread_files(states: Iterable[FileState]) -> list[str]:
+    """Return a sentence on the files that only an object store has that is away; none if there are none."""
+    found = list(states)
+    away = [state for state in found if state.how == "away"]
+    if not away:
+        return []
+    return [
+        f"{len(away)} of {len(found)} files are not here and are not compared, because their object store is away: "
+        f"{away[0].problem}"
+    ]
+
+
 def unlisted_files(folder: Path, listed: frozenset[str]) -> tuple[list[str], list[Fault]]:
     """Return (notes, faults) on files that no row names.
 

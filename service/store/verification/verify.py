@@ -39,7 +39,14 @@ from service.store.verification.anchor_checks import (
 )
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
 from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
-from service.store.verification.file_checks import Elsewhere, Progress, elsewhere_notes, hash_files, unlisted_files
+from service.store.verification.file_checks import (
+    Elsewhere,
+    Progress,
+    elsewhere_notes,
+    hash_files,
+    unlisted_files,
+    unread_files,
+)
 from service.store.verification.people_checks import people_faults
 
 
@@ -219,6 +226,7 @@ def _verify(
     of_log, said_of_log = _log_findings(outside.lines, evidence, site, keys, run_id)
     every_run = run_id is None
     anchored, unread = _anchor_findings(outside, chains, keys, evidence, every_run=every_run)
+    unread = (*unread_files((files or {}).values()), *unread)
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [
         *(Fault(None, None, DATABASE_NAME, problem) for problem in evidence.damage),
