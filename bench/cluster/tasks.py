@@ -158,7 +158,7 @@ def depth(camera: CameraModel, pose: Transform, faces: int) -> tuple[float, floa
 
 def undistortion(file: Path, camera: CameraModel, pose: Transform) -> tuple[float, float]:
     """Undistort a photograph of 60 megapixels and code it again; returns MB read and written."""
-    data = undistorted_data_set(data_set([file], camera, [pose], slab_mesh()))
+    data = undistorted_data_set(data_set([file], camera, [pose], mesh_of(1)))
     return megabytes(file.stat().st_size), megabytes(len(data.pixels.picture(data.views[0])))
 
 

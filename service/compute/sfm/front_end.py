@@ -20,7 +20,7 @@ from service.core.errors import DataError
 from service.machine.executors import mapping
 
 PAIRS_A_TASK = 8  # about two seconds; neighbours in the list share an image, whose features are read once
-_FEWEST_MEGAPIXELS, _FEWEST_PAIRS = 16.0, 100  # that are worth further processes; a pair of 3000 features an image
+_FEWEST_PIXELS, _FEWEST_PAIRS = 16e6, 100  # that are worth further processes; a pair of 3000 features an image
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +161,8 @@ class FrontEnd:
 def processes_worth(files: int, pairs: int, camera: CameraModel, options: SfmOptions) -> int:
     """Return the number of processes of this machine for so much work; starting one takes as long as a megapixel."""
     factor = reduction(options.max_image_size, camera.width, camera.height)
-    megapixels = files * camera.width * camera.height / factor**2 / 1e6
-    worth = megapixels >= _FEWEST_MEGAPIXELS or pairs * (options.max_features / 3000) ** 2 >= _FEWEST_PAIRS
+    pixels = files * camera.width * camera.height / factor**2
+    worth = pixels >= _FEWEST_PIXELS or pairs * (options.max_features / 3000) ** 2 >= _FEWEST_PAIRS
     return options.threads if worth else 1
 
 
