@@ -48,8 +48,12 @@ def main(command_line: Sequence[str] | None = None) -> int:
         return 2
     folder: Path = options.out.resolve() / time.strftime("%Y%m%d-%H%M%S")
     folder.mkdir(parents=True)
-    with sigterm_like_ctrl_c():
-        return run_demo(folder, options.protocol, options.scene, options.image_width)
+    try:
+        with sigterm_like_ctrl_c():
+            return run_demo(folder, options.protocol, options.scene, options.image_width)
+    except KeyboardInterrupt:
+        print("Stopped: every process that was started has ended.", file=sys.stderr)
+        return 130
 
 
 def arguments(command_line: Sequence[str] | None) -> argparse.Namespace:

@@ -164,6 +164,17 @@ def test_the_secrets_are_made_once_and_fit_the_programs_files(tmp_path: Path) ->
 SECRET = re.compile(r"(?i)(password|secret_access_key|secretKey)\"?\s*[:=]\s*[\"']?[A-Za-z0-9/+]{8,}")
 
 
+@pytest.mark.slow
+def test_the_demonstration_of_a_site_names_what_is_missing(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "bench.whole_runs.demo_site", "--out", str(tmp_path / "out")],
+        cwd=REPOSITORY, env={**os.environ, "PATH": str(tmp_path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "sudo apt-get install postgresql" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_no_secret_is_in_the_files() -> None:
     for file in DEPLOY.iterdir():
         text = file.read_text(encoding="utf-8")
