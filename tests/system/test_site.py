@@ -179,7 +179,8 @@ def test_every_kill_left_its_mark_and_the_run_is_whole(ended: Ended) -> None:
     assert said_at(ended, "the cluster is lost")
     (search,) = [job for job in recorded(site, JobFinished) if job.job_kind == "detect_spheres"]
     assert search.computed_on is not None
-    assert sum(host.tasks for host in search.computed_on.cluster) >= 2, "the cluster gave answers before it died"
+    # The last answers may be lost with the scheduler, on their way.
+    assert sum(host.tasks for host in search.computed_on.cluster) >= 1, "the cluster gave answers before it died"
     captured = [view.viewpoint for view in recorded(site, ViewpointCaptured) if view.viewpoint[0] in "vc"]
     assert sorted(captured) == sorted(f"{prefix}1_{i:03d}" for prefix in "vc" for i in range(1, VIEWS + 1))
     measures = {name: value for event in recorded(site, StepMeasured) for name, value in event.measures.items()}
