@@ -10,10 +10,14 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-all test-drawn test-realtime test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo demo-site test test-all test-drawn test-realtime test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
+
+# The same on a whole site, whose servers all run on this machine: needs Debian's PostgreSQL (docs/howto/site.md).
+demo-site: $(TOOLS)
+	$(BIN)/python -m bench.whole_runs.demo_site
 
 # Units, wires and one short run, in minutes; nothing of it needs more than Python and what pip installs. All tests of
 # tests/browser do need more, and are not even read.

