@@ -30,7 +30,11 @@ from tests.support.processes.postgres import OTHER, OWNER, ROLE, Cluster
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run
 
-pytestmark = [pytest.mark.packages("postgresql"), pytest.mark.timeout(300)]
+pytestmark = [
+    pytest.mark.packages("postgresql"),
+    pytest.mark.timeout(300),
+    pytest.mark.sqlite("compares the two databases by itself"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreError
 from service.store.objects.s3 import S3Objects
 from service.store.objects.signed_requests import SignedRequests, StoreKeys
+from tests.support.record.outsider import write_site_file
 
 KEYS = StoreKeys("test-access", "test-secret")
 REGION = "us-east-1"
@@ -115,7 +116,7 @@ class Weed:
             yaml.safe_dump({"access_key_id": KEYS.access_key_id, "secret_access_key": KEYS.secret_access_key})
         )
         section = {"url": f"s3://ready/{prefix}", "endpoint": self.endpoint, "keys": keys.name}
-        (data / "site.yaml").write_text(yaml.safe_dump({"object_store": section, "spool": spool}))
+        write_site_file(data, {"object_store": section, "spool": spool})
         return self.objects("ready", prefix)
 
     def kill(self) -> None:
