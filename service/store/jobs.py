@@ -16,6 +16,7 @@ from service.store.database.database import lease_now_s
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.events import append, canonical, parse_canonical
+from service.store.moved import moved_runs
 from service.store.records import Job, LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity, identity_of, identity_values
 
@@ -88,6 +89,9 @@ def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> 
     statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
     if run_id is not None:
         statement = statement.where(jobs.c.run_id == run_id)
+    elsewhere = moved_runs(connection)
+    if elsewhere:
+        statement = statement.where(jobs.c.run_id.not_in(elsewhere))
     return connection.execute(statement).scalar_one()
 
 
@@ -126,7 +130,9 @@ def claim(
     """
     now = clock.utc_now()
     unfinished = jobs.c.state.in_(("queued", "running"))
-    ordered = select(jobs).where(unfinished, choice.condition()).order_by(jobs.c.priority, jobs.c.position)
+    elsewhere = moved_runs(connection)
+    here = jobs.c.run_id.not_in(elsewhere) if elsewhere else true()
+    ordered = select(jobs).where(unfinished, here, choice.condition()).order_by(jobs.c.priority, jobs.c.position)
     for row in connection.execute(ordered).all():
         if row.state == "running" and not _take_over(connection, clock, row):
             continue

@@ -209,12 +209,15 @@ class Store:
         *,
         actor: str,
         software: Mapping[str, str] | None = None,
+        artefacts: Sequence[NewArtefact] = (),
     ) -> list[Event]:
         """Do as `record_site` in a transaction of `database.writing()`, so that action and record are atomic."""
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
             opened = SiteOpened(software=dict(software or {}))
             begin_chain(connection, self._clock, self._folder, SITE, opened, actor, ())
-        return append(connection, self._clock, SITE, payloads, actor)
+        events = append(connection, self._clock, SITE, payloads, actor)
+        insert_artefacts(connection, self._folder, events, artefacts)
+        return events
 
     def append(self, connection: Connection, run_id: str, payloads: Sequence[Payload], *, actor: str) -> list[Event]:
         """Append to a run's chain within a transaction of `database.writing()`. Raises UnknownRunError."""

@@ -53,6 +53,8 @@ from service.core.records.events.site import (
     ProtocolApproved,
     RecordCopied,
     RecordRebuilt,
+    RunMoved,
+    RunReceived,
     RunSigned,
     ServiceStarted,
     SignaturesWrittenAgain,
@@ -108,7 +110,9 @@ Payload = Annotated[
     | ProtocolApproved
     | DataRestored
     | RecordRebuilt
-    | RecordCopied,
+    | RecordCopied
+    | RunMoved
+    | RunReceived,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
