@@ -31,7 +31,7 @@ from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.journal.rebuild import RebuildReport, rebuild
 from service.store.moving import MoveReport, move_run
 from service.store.records import SITE
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 
 
@@ -323,7 +323,7 @@ def gc_command(
             who = acting_person(opened, operator, password_stdin=password_stdin)
             gone = remove_leftovers(opened, actor=who.name, min_age_s=age_s)
             if gone:
-                checkpoint(opened, SITE)
+                checkpoint_here(opened, SITE)
         left = leftovers(opened, min_age_s=age_s)
     if json:
         print_json({"removed": [asdict(one) for one in gone], "left": [asdict(one) for one in left]})

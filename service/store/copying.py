@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import Connection, Select, Table, func, insert, select
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import RecordCopied
+from service.core.records.events import RecordCopied, SignerNamed
 from service.store.access import KEYS
 from service.store.artefacts import ArtefactFiles, chunks_of
 from service.store.backup.folder import copy_keys, folder_errors
@@ -34,7 +34,9 @@ from service.store.events import canonical, sha256_text
 from service.store.objects.reading import SpoolReader
 from service.store.records import SITE
 from service.store.runs import defer_references
+from service.store.signatures.checkpoints import read_key_changes
 from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.signer import named_signer, this_signer
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
@@ -100,9 +102,18 @@ def copy_record(
     finally:
         origin.close()
     with Store.open(target, files=files, create=False) as store:  # with the keys that are there now
-        store.record_site([recorded], actor=who)
+        store.record_site([recorded, *_signer(store)], actor=who)
         checkpoint(store, SITE)
     return CopyReport(recorded, tuple(missing))
+
+
+def _signer(store: Store) -> list[SignerNamed]:
+    """Return the event by which the copy signs, if its chain names the folder that signed the source."""
+    with store.database.reading() as connection:
+        if named_signer(connection) is None:
+            return []
+        key_id = str(read_key_changes(connection)[-1][1]["key_id"])
+    return [this_signer(store.database_path.parent, key_id)]
 
 
 def _require_new(target: Path) -> None:

@@ -361,6 +361,12 @@ RUN_ELSEWHERE = {
     "orthocapture store copy site-folder archive": (
         "tests/store/test_postgres.py::test_a_record_goes_to_postgresql_and_back_with_every_number_the_same"
     ),
+    "orthocapture store copy runs site-folder --run latest": (
+        "tests/store/test_moving.py::test_a_run_goes_to_another_record_and_back_with_every_number_the_same"
+    ),
+    "orthocapture audit sign-here --data runs": (
+        "tests/store/test_who_signs.py::test_signing_is_handed_over_with_key_and_log"
+    ),
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),

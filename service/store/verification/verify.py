@@ -24,6 +24,7 @@ from service.store.runs import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import LogLine, log_findings, read_log, written_again_findings
 from service.store.signatures.second_place import copy_faults
+from service.store.signatures.signer import in_another_place, signer_elsewhere
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import postgres_checks, search_checks
@@ -186,7 +187,12 @@ def _verify(
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
     notes += elsewhere_notes((files or {}).values())
-    of_log, said_of_log = _log_findings(lines, evidence, site, keys, run_id)
+    named = signer_elsewhere(connection, data_dir)
+    if lines is None and named is not None and in_another_place(named, data_dir):
+        of_log: list[Fault] = []
+        said_of_log = [f"the log of signatures is in {named.folder} on {named.host}: a verification there reads it"]
+    else:
+        of_log, said_of_log = _log_findings(lines, evidence, site, keys, run_id)
     every_run = run_id is None
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [

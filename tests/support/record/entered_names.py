@@ -74,6 +74,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "accounts end-wait": ("accounts", "end-wait", "emmy"),
     "audit rotate-key": ("audit", "rotate-key", "--reason", "yearly"),
+    "audit sign-here": ("audit", "sign-here"),
     "audit export": ("audit", "export", "latest", "made.zip", "--hashes-only"),
     "audit report": ("audit", "report", "latest", "--html", "made.html"),
     "audit release": ("audit", "release", "--yes"),

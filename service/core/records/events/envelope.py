@@ -58,6 +58,7 @@ from service.core.records.events.site import (
     RunSigned,
     ServiceStarted,
     SignaturesWrittenAgain,
+    SignerNamed,
     SignInRecorded,
     SiteOpened,
     TimeStampKept,
@@ -112,7 +113,8 @@ Payload = Annotated[
     | RecordRebuilt
     | RecordCopied
     | RunMoved
-    | RunReceived,
+    | RunReceived
+    | SignerNamed,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

@@ -69,6 +69,16 @@ class KeyChanged(Record):
     reason: str
 
 
+class SignerNamed(Record):
+    """The data folder that signs from here on, where several folders share the database of a site."""
+
+    kind: Literal["signer_named"] = "signer_named"
+    signer: str  # the folder's random name, in its file `signer`
+    key_id: str  # the key in use
+    host: str
+    folder: str
+
+
 class LeftoversRemoved(Record):
     """Files left over from crashes, to which no record refers, were removed."""
 
