@@ -36,7 +36,7 @@ test-drawn: $(TOOLS) $(NETWORKS)
 
 # The tests of the record on PostgreSQL (tests/plugins/database.py); `make test-drawn` runs those of the chains, jobs,
 # crashes and races there.
-ON_POSTGRES = tests/store tests/people tests/verify tests/objects tests/run tests/recovery tests/audit
+ON_POSTGRES = tests/store
 test-postgres: $(TOOLS)
 	.ci/packages
 	$(BIN)/pytest --database postgresql -m "not (realtime or whole or sweep)" $(ON_POSTGRES)

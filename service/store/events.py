@@ -16,6 +16,7 @@ from sqlalchemy import Connection, Row, bindparam, insert, select, update
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
 from service.core.shown_text import storable, storable_data
+from service.store.database.changes import notify
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text
 from service.store.event_index import EventToIndex, index_events
@@ -213,6 +214,7 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
         connection.execute(_INSERT, rows)
         index_events(connection, to_index)
         connection.execute(_MOVE_HEAD, {"run": run_id, "seq": seq, "sha256": previous})
+        notify(connection, "chains", run_id)
     return appended
 
 

@@ -12,6 +12,7 @@ from service.core.errors import IllegalTransitionError
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, Lane
 from service.core.shown_text import storable
+from service.store.database.changes import notify
 from service.store.database.database import lease_now_s
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
@@ -65,6 +66,8 @@ def enqueue(
             )
         )
         appended.append(event)
+    if appended:
+        notify(connection, "jobs", run_id)
     return appended
 
 
@@ -222,6 +225,7 @@ def fail(
         .where(jobs.c.job_id == job.job_id)
         .values(state="queued", token=None, until_utc_s=None, error=storable(f"{error}: {message}"))
     )
+    notify(connection, "jobs", job.run_id)
     return [event]
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, and_, bindparam, select
+from sqlalchemy.exc import NoResultFound
 
-from service.core.errors import StoreError
+from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import RunMoved
 from service.store.database.tables import event_facets, event_index, events
 from service.store.event_index import OF_FACET
@@ -29,11 +31,18 @@ _PAYLOAD = select(events.c.payload).where(events.c.run_id == SITE, events.c.seq 
 
 
 def moved_to(connection: Connection, run_id: str) -> RunMoved | None:
-    """Return where a run goes on, if that is in another record."""
+    """Return where a run goes on, if that is in another record. Raises IntegrityError if its event was altered."""
     last = connection.execute(_LAST, {"run": run_id}).first()
     if last is None or last.kind != "run_moved":
         return None
-    return RunMoved.model_validate_json(connection.execute(_PAYLOAD, {"seq": last.seq}).scalar_one())
+    try:
+        return RunMoved.model_validate_json(connection.execute(_PAYLOAD, {"seq": last.seq}).scalar_one())
+    except (ValidationError, NoResultFound) as error:
+        raise IntegrityError(
+            "the event that says where this run went cannot be read",
+            where=f"{SITE}, event {last.seq}",
+            remedy="Run `orthocapture audit verify all`; nothing is appended to this run",
+        ) from error
 
 
 def moved_runs(connection: Connection) -> frozenset[str]:

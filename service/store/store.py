@@ -19,6 +19,7 @@ from service.core.shown_text import storable
 from service.store import jobs as queue
 from service.store.access import close_to_others, require_access
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
+from service.store.database.changes import Changes, Channel, HeardChanges, PolledChanges
 from service.store.database.database import PATIENCE_S, Database
 from service.store.database.engine import DATABASE_NAME, LOOK, RESTORE, database_path
 from service.store.database.opening import open_database, require_database
@@ -141,6 +142,14 @@ class Store:
             raise StoreError(
                 f"the data folder cannot be reached: {error.strerror}", where=str(error.filename), remedy=LOOK
             ) from error
+
+    def changes(self, channel: Channel) -> Changes:
+        """Return what to wait with until events ("chains") or jobs may have come; close it in the end.
+
+        A clock of its own, as tests have, passes only by itself: with one, this polls.
+        """
+        engine = self._database.listening_engine() if isinstance(self._clock, SystemClock) else None
+        return PolledChanges(self._clock) if engine is None else HeardChanges(engine, channel, self._clock)
 
     def close(self) -> None:
         """Close the database."""

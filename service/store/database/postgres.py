@@ -140,6 +140,10 @@ class PostgresDatabase(Database):
         with self.reading() as connection:
             connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
 
+    def listening_engine(self) -> Engine | None:
+        """Return the engine, from which a connection is taken for good."""
+        return self._engine
+
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()

@@ -11,9 +11,10 @@ import secrets
 import socket
 from pathlib import Path
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
-from service.core.errors import StoreError
+from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import SignerNamed
 from service.store.access import file_mode, open_new
 from service.store.database.database import is_postgres
@@ -31,9 +32,19 @@ _NAMED = (
 
 
 def named_signer(connection: Connection) -> SignerNamed | None:
-    """Return the folder that signs, as the site's chain names it; None for SQLite, or if none was named yet."""
+    """Return the folder that signs, as the site's chain names it; None for SQLite, or if none was named yet.
+
+    Raises IntegrityError if its event was altered.
+    """
     payload = connection.execute(_NAMED).scalar() if is_postgres(connection) else None
-    return None if payload is None else SignerNamed.model_validate_json(payload)
+    try:
+        return None if payload is None else SignerNamed.model_validate_json(payload)
+    except ValidationError as error:
+        raise IntegrityError(
+            "the event that names the folder that signs cannot be read",
+            where=SITE,
+            remedy="Run `orthocapture audit verify all`; nothing is signed",
+        ) from error
 
 
 def signer_elsewhere(connection: Connection, data_dir: Path) -> SignerNamed | None:
