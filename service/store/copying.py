@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Select, Table, func, insert, select
+from sqlalchemy import Connection, RowMapping, Select, Table, func, insert, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import RecordCopied, SignerNamed
@@ -183,7 +183,7 @@ def _copy_rows(reading: Connection, writing: Connection) -> Counter[str]:
     _copy_table(reading, writing, runs, counted)
     place = (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
     for chunk in copied_rows(reading, select(events).join(event_index, place).order_by(event_index.c.position)):
-        writing.execute(insert(events), chunk)
+        writing.execute(insert(events), [dict(row) for row in chunk])
         index_events(writing, [to_index(row) for row in chunk])
         counted[events.name] += len(chunk)
     for table in _TABLES:
@@ -191,7 +191,7 @@ def _copy_rows(reading: Connection, writing: Connection) -> Counter[str]:
     return counted
 
 
-def to_index(row: dict[str, Any]) -> EventToIndex:
+def to_index(row: RowMapping) -> EventToIndex:
     """Return a row of events as what the index is made from."""
     return EventToIndex(row["run_id"], row["seq"], row["kind"], row["actor"], plain_payload(row["payload"]))
 
@@ -199,15 +199,15 @@ def to_index(row: dict[str, Any]) -> EventToIndex:
 def _copy_table(reading: Connection, writing: Connection, table: Table, counted: Counter[str]) -> None:
     order = [table.c.at_utc] if table is checkpoints else []  # the order in which they were made
     for chunk in copied_rows(reading, select(table).order_by(*order, *table.primary_key.columns)):
-        writing.execute(insert(table), chunk)
+        writing.execute(insert(table), [dict(row) for row in chunk])
         counted[table.name] += len(chunk)
 
 
-def copied_rows(connection: Connection, statement: Any) -> Iterator[Sequence[dict[str, Any]]]:
+def copied_rows(connection: Connection, statement: Any) -> Iterator[Sequence[RowMapping]]:
     """Yield the rows of a statement as plain values, some at a time."""
     rows = connection.execution_options(yield_per=_AT_ONCE).execute(statement)
     for chunk in rows.mappings().partitions(_AT_ONCE):
-        yield [dict(row) for row in chunk]
+        yield list(chunk)
 
 
 def _require_equal_ends(reading: Connection, writing: Connection) -> dict[str, str]:

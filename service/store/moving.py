@@ -186,14 +186,14 @@ def _copy_chain(reading: Connection, writing: Connection, run_id: str, first: in
     count = 0
     chain = select(events).where(events.c.run_id == run_id, events.c.seq > first).order_by(events.c.seq)
     for chunk in copied_rows(reading, chain):
-        writing.execute(insert(events), chunk)
+        writing.execute(insert(events), [dict(row) for row in chunk])
         index_events(writing, [to_index(row) for row in chunk])
         count += len(chunk)
     head = dict(reading.execute(select(heads).where(heads.c.run_id == run_id)).mappings().one())
     writing.execute(update(heads).where(heads.c.run_id == run_id).values(**head) if first else insert(heads), head)
     of_run = select(artefacts).where(artefacts.c.run_id == run_id, artefacts.c.seq > first)
     for chunk in copied_rows(reading, of_run.order_by(artefacts.c.seq, artefacts.c.position)):
-        writing.execute(insert(artefacts), chunk)
+        writing.execute(insert(artefacts), [dict(row) for row in chunk])
     return count
 
 
@@ -207,8 +207,7 @@ def _copy_jobs(reading: Connection, writing: Connection, run_id: str) -> None:
         for row in chunk:
             if row["job_id"] not in places:
                 places[row["job_id"]], next_place = next_place, next_place + 1
-            row["position"] = places[row["job_id"]]
-        writing.execute(insert(jobs), chunk)
+        writing.execute(insert(jobs), [{**row, "position": places[row["job_id"]]} for row in chunk])
 
 
 def _signatures(reading: Connection, run_id: str) -> Mapping[str, Any]:
@@ -225,4 +224,4 @@ def _signatures(reading: Connection, run_id: str) -> Mapping[str, Any]:
 
 
 def _plain(reading: Connection, statement: Any) -> Sequence[dict[str, Any]]:
-    return [row for chunk in copied_rows(reading, statement) for row in chunk]
+    return [dict(row) for chunk in copied_rows(reading, statement) for row in chunk]

@@ -191,6 +191,7 @@ RUN_ELSEWHERE = {
         "tests/code_rules/test_suite_rules.py::"
         "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
     ),
+    "make test-postgres": "tests/store/test_store_crash.py::test_crash_at_every_point_of_a_record",
     **dict.fromkeys(
         ("make marks", "make marks FILES=tests/core"),
         "tests/code_rules/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
