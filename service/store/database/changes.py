@@ -25,7 +25,7 @@ def notify(connection: Connection, channel: Channel, run_id: str) -> None:
 
 
 class Changes(ABC):
-    """What somebody waits with who has looked and found nothing. One thread uses it."""
+    """Waits for whoever has looked and found nothing. One thread uses it."""
 
     @abstractmethod
     def wait(self, seconds: float) -> None:
