@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo demo-site test test-all test-drawn test-realtime test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo demo-site test test-all test-drawn test-postgres test-realtime test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -36,6 +36,14 @@ SEED = $(shell git rev-parse HEAD)
 test-drawn: $(TOOLS) $(NETWORKS)
 	.ci/packages
 	$(BIN)/pytest -m "(slow or packages or whole or sweep) and not realtime" --draw $(SEED) $(call with,slow|packages|whole|sweep) tests/browser
+	$(BIN)/pytest --database postgresql tests/store/test_store_*.py
+
+# The tests of the record on PostgreSQL (tests/plugins/database.py); `make test-drawn` runs those of the chains, jobs,
+# crashes and races there.
+ON_POSTGRES = tests/store
+test-postgres: $(TOOLS)
+	.ci/packages
+	$(BIN)/pytest --database postgresql -m "not (realtime or whole or sweep)" $(ON_POSTGRES)
 
 # The tests that meet the clock, with nothing else: two at a time, for they wait most of theirs. Beside much more than that
 # none fails by chance (bench/suite/realtime.py).

@@ -19,6 +19,7 @@ from service.steps.protocol_check import require_devices, require_plausible
 from service.store.disk_space import forecast_of, require_space
 from service.store.records import NewArtefact
 from service.store.signatures.second_place import SecondPlace
+from service.store.signatures.signing import require_signs_here
 from service.store.store import Store
 
 if TYPE_CHECKING:
@@ -158,8 +159,10 @@ def second_place(rig: Rig, store: Store) -> SecondPlace:
 def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:
     """Raise ConfigurationError while a living process drives another run with the same rig file.
 
-    `run_id` is the run to be driven; "" for a new one.
+    `run_id` is the run to be driven; "" for a new one. Raises SignsElsewhereError if another data folder signs the
+    site: each step of a run is signed at once.
     """
+    require_signs_here(store)
     for other in store.runs():
         if other.run_id == run_id or not store.driven(other.run_id):
             continue

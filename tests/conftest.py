@@ -46,6 +46,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     parser.addoption("--cpu-below", type=float, metavar="S", help="leave out tests that cost S CPU seconds or more")
     parser.addoption("--draw", metavar="SEED", help="run a tenth of the whole runs and sweeps, chosen by SEED")
+    parser.addoption("--database", choices=["postgresql"], help="run the tests of the record on PostgreSQL")
     parser.addoption(
         "--repeat", type=int, default=1, metavar="N", help="run every test N times (bench.suite.realtime)"
     )
@@ -63,6 +64,10 @@ def pytest_configure(config: pytest.Config) -> None:
     seed: str | None = config.getoption("--draw")
     if seed is not None:
         config.pluginmanager.register(Draw(seed))
+    if config.getoption("--database") is not None:
+        from tests.plugins.database import OnPostgres  # noqa: PLC0415 - it loads the store
+
+        config.pluginmanager.register(OnPostgres(config))
 
 
 @pytest.fixture

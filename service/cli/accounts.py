@@ -11,7 +11,7 @@ from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.people.rows import plain_name
 from service.people.sessions import People
 from service.store.records import SITE
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 
 accounts_app = typer.Typer(name="accounts", help="Maintain the accounts of a site.", no_args_is_help=True)
@@ -35,7 +35,7 @@ def end_wait_command(
         who = acting_person(store, operator, "administer", password_stdin=password_stdin)
         name = plain_name(account)
         People(store).accounts.end_wait(who.name, name)
-        checkpoint(store, SITE)
+        checkpoint_here(store, SITE)
         if json:
             print_json({"account": name, "wait": "ended"})
         else:

@@ -48,7 +48,7 @@ from service.store.data_folder import data_folder
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
 from service.store.runs import resolve_run
-from service.store.signatures.signing import PublicKey, checkpoint, public_keys, rotate_key
+from service.store.signatures.signing import PublicKey, checkpoint, public_keys, rotate_key, sign_here
 from service.store.store import Store
 from service.store.verification import verify as audit
 from service.store.verification.verify import AuditReport, EvidenceRecord
@@ -251,6 +251,26 @@ def keys_command(data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> N
         state = "in use" if key.replaced_seq is None else "replaced"
         gap = "" if key.introduced or key is keys[0] else ", not vouched for by the key before it"
         console.tell(f"{key.key_id}  {state}", (gap, "yellow"), f"  ({key.reason})")
+
+
+@audit_app.command("sign-here")
+def sign_here_command(
+    data: DataOption = DEFAULT_DATA,
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Let this data folder sign a site whose database several folders share, instead of the one that signs now.
+
+    First end the processes of that folder and move its keys/ and signatures.jsonl here.
+    """
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        who = acting_person(store, operator, password_stdin=password_stdin)
+        made = sign_here(store, actor=who.name)
+    if json:
+        print_json(asdict(made))
+    else:
+        console.print(f"This folder signs the site from now on, with key {made.key_id}.")
 
 
 @audit_app.command("rotate-key")

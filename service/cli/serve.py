@@ -43,7 +43,7 @@ from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.durable_effects import utc_text
 from service.store.records import SITE
 from service.store.signatures.second_place import away_words
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 from service.web.app import create_app
 from service.web.connections import ConnectionLimits, affordable_connections
@@ -228,7 +228,10 @@ def _unprotected(host: str) -> ConfigurationError:
 
 def _seal(site: Site) -> None:
     """Sign the end of the site's chain, and keep a copy of the signature where the rig says."""
-    checkpoint(site.store, SITE)
+    if checkpoint_here(site.store, SITE) is None:
+        error_console.print(
+            "Another data folder signs this site; what is recorded here is signed there", markup=False
+        )
     away = site.second_place.update()
     if away is not None:
         error_console.print(away_words(away), markup=False)

@@ -29,8 +29,9 @@ from service.store.copying import copy_record
 from service.store.database.postgres import prepare
 from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.journal.rebuild import RebuildReport, rebuild
+from service.store.moving import MoveReport, move_run
 from service.store.records import SITE
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 
 
@@ -242,6 +243,10 @@ def copy_command(
     target: Annotated[
         Path, typer.Argument(metavar="TO", help="Data folder to copy to: new, or with nothing but a site.yaml.")
     ],
+    run: Annotated[
+        str,
+        typer.Option("--run", help="Instead, move this run alone: it goes on in TO, which may have others."),
+    ] = "",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
     json: JsonOption = False,
@@ -249,13 +254,19 @@ def copy_command(
     """Copy a whole record with its files, accounts and keys, from SQLite to PostgreSQL or back.
 
     End every process of the source first: what is recorded there afterwards is not in the copy. The exit status is 1
-    if a file of the record was missing or altered.
+    if a file of the record was missing or altered. With --run, one run is moved: FROM keeps what was recorded and
+    refuses to go on with it. After an interruption, repeat the command and it will continue.
     """
 
     def actor(folder: Path) -> str:
         with Store.open(folder, create=False) as store:
             return acting_person(store, operator, "read", password_stdin=password_stdin).name
 
+    if run:
+        with reporting_errors(json), progress_bar(quiet=json) as progress:
+            moved = move_run(source, target, run, actor=actor, progress=progress)
+        _print_move(moved, json=json)
+        return
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         made = copy_record(source, target, actor=actor, progress=progress)
     if json:
@@ -269,6 +280,18 @@ def copy_command(
         console.print("  Run: orthocapture audit verify all --data TO", markup=False)
     if made.missing:
         raise typer.Exit(ExitStatus.FAILED)
+
+
+def _print_move(made: MoveReport, *, json: bool) -> None:
+    done = made.received
+    if json:
+        received = None if done is None else done.model_dump(mode="json")
+        print_json({"run": made.run_id, "moved": made.moved.model_dump(mode="json"), "received": received})
+        return
+    said = "an earlier try had copied it" if done is None else f"{counted(done.events, 'event')}, {done.files} files"
+    console.print(f"Moved: {made.run_id} ({said}).")
+    console.print(f"  head: event {made.moved.seq}, {made.moved.sha256}")
+    console.print("  It goes on in TO; FROM refuses to. Run: orthocapture audit verify all --data TO", markup=False)
 
 
 @store_app.command("gc")
@@ -300,7 +323,7 @@ def gc_command(
             who = acting_person(opened, operator, "read", password_stdin=password_stdin)
             gone = remove_leftovers(opened, actor=who.name, min_age_s=age_s)
             if gone:
-                checkpoint(opened, SITE)
+                checkpoint_here(opened, SITE)
         left = leftovers(opened, min_age_s=age_s)
     if json:
         print_json({"removed": [asdict(one) for one in gone], "left": [asdict(one) for one in left]})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import socket
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from os import getpid
 
@@ -50,6 +51,7 @@ from service.runner.pedal import Pedal
 from service.runner.software import software_versions
 from service.runner.upkeep import PASSING, ClockWatch, DiskWatch, RecordTrouble, Seal, short_collections
 from service.steps.context import Devices
+from service.store.database.changes import Changes
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
@@ -74,6 +76,7 @@ class Runner:
     second_place: SecondPlace | None = None
     held_up: Callable[[], Starvation] = held_up_here
     _run: HeldRun = field(init=False)
+    _changes: Changes = field(init=False)
     _seal: Seal = field(init=False)
     _pedal: Pedal = field(init=False)
     _clocks: ClockWatch = field(init=False)
@@ -89,7 +92,11 @@ class Runner:
         PersonNeededError if nobody attends who could decide.
         """
         operator, clock = self.operator, self.store.clock
-        with short_collections(), held_run(self.store, self.run_id, self.protocol) as self._run:
+        with (
+            short_collections(),
+            closing(self.store.changes("chains")) as self._changes,
+            held_run(self.store, self.run_id, self.protocol) as self._run,
+        ):
             place = self.second_place or SecondPlace([], clock)
             self._seal = Seal(self.store, self.run_id, self.authority, place, operator.busy, operator.tell)
             if self._run.state.terminal:
@@ -187,7 +194,7 @@ class Runner:
             case Halt():
                 self.operator.show("paused", 0, 0)
                 self.operator.attend("paused", state, pedal_armed=False)
-                self.store.clock.sleep(_POLL_S)
+                self._changes.wait(_POLL_S)
 
     def _prepared(self, step: str, attempt: int) -> bool:
         """Let a simulated technician do what was confirmed; if that fails, so does the attempt."""
@@ -246,7 +253,7 @@ class Runner:
         answer = self._by_pedal(question, state) or self.operator.poll(question, state)
         self.operator.attend("asking", state, pedal_armed=self._pedal.armed, asked=question)
         if answer is None:
-            self.store.clock.sleep(_POLL_S)
+            self._changes.wait(_POLL_S)
         elif isinstance(answer, AnswerBy):
             self.submit(answer.action, answer.actor)
         else:

@@ -18,6 +18,7 @@ from service.core.errors import StoreError
 
 KEYS = "keys"  # the folder that is never shared
 PEPPER = "pepper"  # within it, the key to which hashes of PINs and badges are bound
+_FILES = "artefacts"  # the folder of the files
 _LOG = logging.getLogger(__name__)
 _SHARED = stat.S_ISGID | stat.S_IRWXG
 _REMEDY = (
@@ -130,13 +131,18 @@ def close_to_others(folder: Path, database: str) -> None:
 
 
 def _differs(database: Path, kept: int, group: int) -> bool:
-    """Return whether a database is shared otherwise than its folder; one that does not exist is not."""
+    """Return whether a database, or where there is none the folder of the files, is shared otherwise than wanted."""
+    entered = 0o060
     try:
         held = database.stat()
     except FileNotFoundError:
-        return False
+        entered = 0o070
+        try:
+            held = database.with_name(_FILES).stat()
+        except FileNotFoundError:
+            return False
     rights = (held.st_mode & 0o077, held.st_gid)
-    return rights != (kept & 0o060, group if kept else held.st_gid)
+    return rights != (kept & entered, group if kept else held.st_gid)
 
 
 def _within(folder: Path) -> Iterator[Path]:

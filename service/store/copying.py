@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Table, func, insert, select
+from sqlalchemy import Connection, RowMapping, Select, Table, func, insert, select
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import RecordCopied
+from service.core.records.events import RecordCopied, SignerNamed
 from service.store.access import KEYS
 from service.store.artefacts import ArtefactFiles, chunks_of
 from service.store.backup.folder import copy_keys, folder_errors
@@ -34,7 +34,9 @@ from service.store.events import canonical, sha256_text
 from service.store.objects.reading import SpoolReader
 from service.store.records import SITE
 from service.store.runs import defer_references
+from service.store.signatures.checkpoints import read_key_changes
 from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.signer import named_signer, this_signer
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
@@ -82,7 +84,8 @@ def copy_record(
     try:
         with origin.reading() as reading, Store.open(target, files=files) as store:
             _require_no_record(store)
-            missing, copied = _copy_files(reading, source, store, progress)
+            every = select(artefacts.c.sha256, artefacts.c.size_bytes)
+            missing, copied = copy_artefacts(reading, every, source, store, progress)
             with store.database.writing() as writing:
                 number = _copy_rows(reading, writing)
                 ends = _require_equal_ends(reading, writing)
@@ -99,9 +102,18 @@ def copy_record(
     finally:
         origin.close()
     with Store.open(target, files=files, create=False) as store:  # with the keys that are there now
-        store.record_site([recorded], actor=who)
+        store.record_site([recorded, *_signer(store)], actor=who)
         checkpoint(store, SITE)
     return CopyReport(recorded, tuple(missing))
+
+
+def _signer(store: Store) -> list[SignerNamed]:
+    """Return the event by which the copy signs, if its chain names the folder that signed the source."""
+    with store.database.reading() as connection:
+        if named_signer(connection) is None:
+            return []
+        key_id = str(read_key_changes(connection)[-1][1]["key_id"])
+    return [this_signer(store.database_path.parent, key_id)]
 
 
 def _require_new(target: Path) -> None:
@@ -125,10 +137,20 @@ def _require_no_record(store: Store) -> None:
         )
 
 
-def _copy_files(reading: Connection, source: Path, store: Store, progress: Progress | None) -> tuple[list[str], int]:
-    """Copy all files that the record refers to; return those that the source lacks, and the number copied."""
+def copy_artefacts(
+    reading: Connection, chosen: Select[Any, Any], source: Path, store: Store, progress: Progress | None
+) -> tuple[list[str], int]:
+    """Copy the chosen files of a record; return those that the source does not have, and the number copied.
+
+    Args:
+        reading: a connection to the source's database.
+        chosen: a query of artefacts.sha256 and artefacts.size_bytes.
+        source: the data folder to copy from.
+        store: the store to copy to.
+        progress: a function that is called with the number of bytes copied.
+    """
     origin = SpoolReader(source, ArtefactFiles(source / "artefacts", DurableFiles(), RandomIds()))
-    named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
+    named = chosen.distinct().order_by(artefacts.c.sha256)
     sizes = {row.sha256: int(row.size_bytes) for row in reading.execute(named)}
     missing: list[str] = []
     done = 0
@@ -160,31 +182,32 @@ def _copy_rows(reading: Connection, writing: Connection) -> Counter[str]:
     counted: Counter[str] = Counter()
     _copy_table(reading, writing, runs, counted)
     place = (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
-    for chunk in _chunks(reading, select(events).join(event_index, place).order_by(event_index.c.position)):
-        writing.execute(insert(events), chunk)
-        index_events(writing, [_to_index(row) for row in chunk])
+    for chunk in copied_rows(reading, select(events).join(event_index, place).order_by(event_index.c.position)):
+        writing.execute(insert(events), [dict(row) for row in chunk])
+        index_events(writing, [to_index(row) for row in chunk])
         counted[events.name] += len(chunk)
     for table in _TABLES:
         _copy_table(reading, writing, table, counted)
     return counted
 
 
-def _to_index(row: dict[str, Any]) -> EventToIndex:
+def to_index(row: RowMapping) -> EventToIndex:
+    """Return a row of events as what the index is made from."""
     return EventToIndex(row["run_id"], row["seq"], row["kind"], row["actor"], plain_payload(row["payload"]))
 
 
 def _copy_table(reading: Connection, writing: Connection, table: Table, counted: Counter[str]) -> None:
     order = [table.c.at_utc] if table is checkpoints else []  # the order in which they were made
-    for chunk in _chunks(reading, select(table).order_by(*order, *table.primary_key.columns)):
-        writing.execute(insert(table), chunk)
+    for chunk in copied_rows(reading, select(table).order_by(*order, *table.primary_key.columns)):
+        writing.execute(insert(table), [dict(row) for row in chunk])
         counted[table.name] += len(chunk)
 
 
-def _chunks(connection: Connection, statement: Any) -> Iterator[Sequence[dict[str, Any]]]:
+def copied_rows(connection: Connection, statement: Any) -> Iterator[Sequence[RowMapping]]:
     """Yield the rows of a statement as plain values, some at a time."""
     rows = connection.execution_options(yield_per=_AT_ONCE).execute(statement)
     for chunk in rows.mappings().partitions(_AT_ONCE):
-        yield [dict(row) for row in chunk]
+        yield list(chunk)
 
 
 def _require_equal_ends(reading: Connection, writing: Connection) -> dict[str, str]:

@@ -29,6 +29,7 @@ FACETS: Mapping[str, tuple[str, ...]] = {
     "field": ("field",),
     "job": ("job",),
     "job_kind": ("job_kind",),
+    "moved_run": ("moved_run",),
     "outcome": ("outcome",),
     "protocol_id": ("protocol_id",),
     "protocol_sha256": ("protocol_sha256",),

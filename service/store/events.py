@@ -16,9 +16,11 @@ from sqlalchemy import Connection, Row, bindparam, insert, select, update
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
 from service.core.shown_text import storable, storable_data
+from service.store.database.changes import notify
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text
 from service.store.event_index import EventToIndex, index_events
+from service.store.moved import require_here
 
 ROOT = "0" * 64  # previous_sha256 of the first event
 _SAFE = 2**53 - 1
@@ -185,8 +187,9 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
 
     Raises:
         IntegrityError: the chain does not end where the last append left it.
-        StoreError: a payload has no canonical form.
+        StoreError: a payload has no canonical form, or the run was moved to another record.
     """
+    require_here(connection, run_id)
     seq, previous = read_head(connection, run_id)
     appended: list[Event] = []
     rows: list[dict[str, Any]] = []
@@ -211,6 +214,7 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
         connection.execute(_INSERT, rows)
         index_events(connection, to_index)
         connection.execute(_MOVE_HEAD, {"run": run_id, "seq": seq, "sha256": previous})
+        notify(connection, "chains", run_id)
     return appended
 
 

@@ -12,10 +12,12 @@ from service.core.errors import IllegalTransitionError
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, Lane
 from service.core.shown_text import storable
+from service.store.database.changes import notify
 from service.store.database.database import lease_now_s
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.events import append, canonical, parse_canonical
+from service.store.moved import moved_runs
 from service.store.records import Job, LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity, identity_of, identity_values
 
@@ -64,6 +66,8 @@ def enqueue(
             )
         )
         appended.append(event)
+    if appended:
+        notify(connection, "jobs", run_id)
     return appended
 
 
@@ -92,6 +96,9 @@ def open_jobs(
         statement = statement.where(jobs.c.run_id == run_id)
     if kinds is not None:
         statement = statement.where(jobs.c.kind.in_(tuple(kinds)))
+    elsewhere = moved_runs(connection)
+    if elsewhere:
+        statement = statement.where(jobs.c.run_id.not_in(elsewhere))
     return connection.execute(statement).scalar_one()
 
 
@@ -130,7 +137,9 @@ def claim(
     """
     now = clock.utc_now()
     unfinished = jobs.c.state.in_(("queued", "running"))
-    ordered = select(jobs).where(unfinished, choice.condition()).order_by(jobs.c.priority, jobs.c.position)
+    elsewhere = moved_runs(connection)
+    here = jobs.c.run_id.not_in(elsewhere) if elsewhere else true()
+    ordered = select(jobs).where(unfinished, here, choice.condition()).order_by(jobs.c.priority, jobs.c.position)
     for row in connection.execute(ordered).all():
         if row.state == "running" and not _take_over(connection, clock, row):
             continue
@@ -220,6 +229,7 @@ def fail(
         .where(jobs.c.job_id == job.job_id)
         .values(state="queued", token=None, until_utc_s=None, error=storable(f"{error}: {message}"))
     )
+    notify(connection, "jobs", job.run_id)
     return [event]
 
 

@@ -35,6 +35,10 @@ class SigningKeyError(StoreError):
     """The private key that signs checkpoints is missing, unusable or readable by others; the record is unaffected."""
 
 
+class SignsElsewhereError(SigningKeyError):
+    """Another of the data folders that share a site's database signs; the record is unaffected."""
+
+
 class TimestampError(StoreError):
     """A time-stamp authority cannot be reached or its answer does not verify; the evidence is valid without it."""
 

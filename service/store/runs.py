@@ -21,6 +21,7 @@ from service.store.database.tables import event_facets, event_index, heads, leas
 from service.store.durable_effects import Clock, IdSource, SystemClock
 from service.store.event_index import OF_FACET
 from service.store.events import ROOT, append
+from service.store.moved import moved_runs
 from service.store.records import SITE, LeaseHeldError, LeaseLostError, NewArtefact, RunRow, UnknownRunError
 
 _ENDS = ("run_completed", "run_aborted")
@@ -73,7 +74,10 @@ def read_runs(connection: Connection) -> list[RunRow]:
 
 
 def read_open_runs(connection: Connection) -> set[str]:
-    """Return runs with neither an end recorded by the runner nor an operator's abort, which it confirms later."""
+    """Return runs with neither an end recorded by the runner nor an operator's abort, which it confirms later.
+
+    A run that goes on in another record is not among them.
+    """
     ended = (
         select(event_index.c.seq)
         .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
@@ -92,7 +96,7 @@ def read_open_runs(connection: Connection) -> set[str]:
         .exists()
     )
     found = select(heads.c.run_id).where(heads.c.run_id != SITE, ~ended, ~aborted)
-    return set(connection.execute(found).scalars())
+    return set(connection.execute(found).scalars()) - moved_runs(connection)
 
 
 def resolve_run(known: Sequence[RunRow], name: str) -> str:

@@ -19,6 +19,7 @@ from service.core.shown_text import storable
 from service.store import jobs as queue
 from service.store.access import close_to_others, require_access
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
+from service.store.database.changes import Changes, Channel, HeardChanges, PolledChanges
 from service.store.database.database import PATIENCE_S, Database
 from service.store.database.engine import DATABASE_NAME, LOOK, RESTORE, database_path
 from service.store.database.opening import open_database, require_database
@@ -142,6 +143,14 @@ class Store:
                 f"the data folder cannot be reached: {error.strerror}", where=str(error.filename), remedy=LOOK
             ) from error
 
+    def changes(self, channel: Channel) -> Changes:
+        """Return what to wait with until events ("chains") or jobs may have come; close it in the end.
+
+        A clock of its own, as tests have, passes only by itself: with one, this polls.
+        """
+        engine = self._database.listening_engine() if isinstance(self._clock, SystemClock) else None
+        return PolledChanges(self._clock) if engine is None else HeardChanges(engine, channel, self._clock)
+
     def close(self) -> None:
         """Close the database."""
         self._database.close()
@@ -209,12 +218,15 @@ class Store:
         *,
         actor: str,
         software: Mapping[str, str] | None = None,
+        artefacts: Sequence[NewArtefact] = (),
     ) -> list[Event]:
         """Do as `record_site` in a transaction of `database.writing()`, so that action and record are atomic."""
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
             opened = SiteOpened(software=dict(software or {}))
             begin_chain(connection, self._clock, self._folder, SITE, opened, actor, ())
-        return append(connection, self._clock, SITE, payloads, actor)
+        events = append(connection, self._clock, SITE, payloads, actor)
+        insert_artefacts(connection, self._folder, events, artefacts)
+        return events
 
     def append(self, connection: Connection, run_id: str, payloads: Sequence[Payload], *, actor: str) -> list[Event]:
         """Append to a run's chain within a transaction of `database.writing()`. Raises UnknownRunError."""

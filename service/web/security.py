@@ -30,7 +30,7 @@ from service.people.person import (
 )
 from service.store.durable_effects import Clock
 from service.store.records import SITE, UnknownRunError
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint_here
 from service.web.connections import Connection
 from service.web.site import CurrentSite, Site
 
@@ -226,7 +226,7 @@ def seal(site: Site) -> None:
     try:
         seq = site.store.head(SITE)
         if seq != site.sealed_seq:
-            checkpoint(site.store, SITE)
+            checkpoint_here(site.store, SITE)
             site.sealed_seq = seq
             site.second_place.update()
     except UnknownRunError:

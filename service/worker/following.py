@@ -17,7 +17,7 @@ from service.followed_run import RunFollower
 from service.run_record import recorded_protocol, recorded_root
 from service.steps.due_jobs import due
 from service.store.records import Job, NewArtefact, NewJob
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 
 _log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ class FollowedRuns:
         if log is None or not log.refresh().terminal or self._store.driven(run_id):
             return
         try:
-            checkpoint(self._store, run_id)
+            checkpoint_here(self._store, run_id)
         except StoreError as error:
             _log.warning("the record of %s could not be signed: %s", run_id, error)
 

@@ -10,7 +10,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -72,21 +72,22 @@ def work(
     following: FollowedRuns | None = None
     done = 0
     waiting = False
-    while not stop():
-        waiting = _disk_full(store, told=waiting)
-        if waiting:
-            store.clock.sleep(_POLL_S)
-            continue
-        job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS if kinds is None else kinds), lane=lane)
-        if job is None:
-            if until_idle:
-                return done
-            store.clock.sleep(_POLL_S)
-            continue
-        following = following or _following(store)
-        _do(store, job, progress, following, end)
-        done += 1
-        finished()
+    with closing(store.changes("jobs")) as changes:
+        while not stop():
+            waiting = _disk_full(store, told=waiting)
+            if waiting:
+                store.clock.sleep(_POLL_S)
+                continue
+            job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS if kinds is None else kinds), lane=lane)
+            if job is None:
+                if until_idle:
+                    return done
+                changes.wait(_POLL_S)
+                continue
+            following = following or _following(store)
+            _do(store, job, progress, following, end)
+            done += 1
+            finished()
     return done
 
 

@@ -37,6 +37,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of
+from tests.support.record.outsider import copy_data
 from tests.support.recorded import reported_run
 from tests.support.recorded.reported_run import record_reported_run
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
@@ -181,7 +182,7 @@ def test_a_displaced_control_sphere_and_contradicting_inputs_are_said_in_words(
 
 
 def test_evidence_that_does_not_verify_is_said_first_and_loudest(folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(folder / "data", tmp_path / "data")
+    copy_data(folder / "data", tmp_path / "data")
     run = read_run(tmp_path / "data", "latest")
     photograph = next(a for a in run.artefacts if a.ref.kind == "image" and a.attempt == 2)
     path = run.files.artefact_path(photograph.ref.sha256)

@@ -19,7 +19,7 @@ from service.store.verification.verify import verify
 
 RECORDED = Path(__file__).parents[1] / "data" / "recorded"
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.sqlite("a record of an earlier version, in SQLite")]
 
 
 def quiet(_what: str, _done: int, _total: int) -> None:

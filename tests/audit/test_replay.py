@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.jobs import Reference, jobs_of, references_in, resolve
 from service.core.records.events import ArtefactRef
 from service.worker import loop
+from tests.support.record.outsider import copy_data
 from tests.support.runs.recorded_run import record_run
 
 _locate_spheres = loop.HANDLERS["locate_spheres"]
@@ -163,7 +163,7 @@ def test_rounding_is_equal_and_said(folder: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_an_altered_input_file_is_named_before_anything_is_computed(folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(folder / "data", tmp_path / "data")
+    copy_data(folder / "data", tmp_path / "data")
     run = read_run(tmp_path / "data", "latest")
     (mesh, *_) = [a for a in run.artefacts if a.ref.kind == "scan_mesh"]
     path = run.files.artefact_path(mesh.ref.sha256)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from service.store.signatures.second_place import SecondPlace, away_words
 from tests.support.hostile_places import PAGES, READING, elements_made, read_by, record_of_hostile_texts, settled
 from tests.support.hostile_text import obeyed
 from tests.support.pages.web import web_site
+from tests.support.record.outsider import copy_data
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_every_command_that_reads_it_prints_escapes(recorded: tuple[Path, str, s
 @pytest.mark.parametrize("which", ["completed", pytest.param("open", marks=pytest.mark.sweep)])
 def test_no_page_makes_elements_of_it(recorded: tuple[Path, str, str], tmp_path: Path, which: str) -> None:
     data, *runs = recorded
-    shutil.copytree(data, tmp_path / "data")
+    copy_data(data, tmp_path / "data")
     with web_site(tmp_path) as site:
         browser = site.browser("administrator")
         for page in PAGES:

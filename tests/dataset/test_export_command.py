@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -26,7 +25,7 @@ from service.dataset.run_data_set import control_spheres, data_set_of, specimen_
 from service.dataset.view_covariances import pose_covariance
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import tamper
+from tests.support.record.outsider import copy_data, tamper
 from tests.support.recorded.reported_run import record_reported_run
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 from tests.support.runs.bench_run import record_runs
@@ -155,7 +154,7 @@ def test_an_export_of_altered_evidence_is_refused(recorded: Path, tmp_path: Path
     ],
 )
 def test_an_export_without_its_signatures_is_refused(recorded: Path, tmp_path: Path, statement: str) -> None:
-    shutil.copytree(recorded, tmp_path / "data")
+    copy_data(recorded, tmp_path / "data")
     tamper(tmp_path / "data", statement)
     status, printed = export(tmp_path / "data", "--format", "gltf", "--out", str(tmp_path / "out"), "--json")
     assert status != 0

@@ -206,6 +206,7 @@ def test_without_a_site_file_nothing_is_asked(tmp_path: Path) -> None:
     assert any(fault.what.startswith("the file is missing (") for fault in verify(tmp_path / "data").faults)
 
 
+@pytest.mark.sqlite("backups and journal: a server has its own")
 def test_a_rebuilt_database_misses_no_freed_file_and_the_store_is_asked_again(weed: Weed, tmp_path: Path) -> None:
     store, bench, objects = uploaded(weed, tmp_path)
     with store:

@@ -12,6 +12,7 @@ from service.cli.main import app
 from service.core.errors import ConfigurationError
 from service.store.objects.opening import open_objects
 from service.store.site import load_site
+from tests.support.record.outsider import write_site_file
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 STORE = "object_store: {url: 's3://bucket/site', endpoint: 'https://store.example'%s}\n"
@@ -99,7 +100,7 @@ def test_without_obstore_its_extra_is_named(tmp_path: Path, monkeypatch: pytest.
 def test_the_file_stands_for_its_folder_and_no_other_file_does(tmp_path: Path) -> None:
     with bench_store(tmp_path / "data") as store:
         run = begin_run(store, PROTOCOL, tmp_path).run_id
-    (tmp_path / "data" / "site.yaml").write_text("spool: {}")
+    write_site_file(tmp_path / "data", {"spool": {}})
     (tmp_path / "data" / "other.yaml").write_text("spool: {}")
     listed = CliRunner().invoke(app, ["runs", "--data", str(tmp_path / "data" / "site.yaml")])
     assert listed.exit_code == 0, listed.output

@@ -24,6 +24,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.object_store import Weed
 from tests.support.processes.waiting import until
+from tests.support.record.outsider import write_site_file
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 
 
@@ -201,7 +202,7 @@ def test_the_command_says_what_waits_and_why(weed: Weed, tmp_path: Path) -> None
         done = CliRunner().invoke(app, ["store", "upload", "--json", "--data", str(tmp_path / "data")])
         assert done.exit_code == 0, done.output
         assert json.loads(done.output)["confirmed"] == len(recorded(store, bench))
-    (tmp_path / "data" / "site.yaml").unlink()
+    write_site_file(tmp_path / "data", {})
     refused = CliRunner().invoke(app, ["store", "upload", "--data", str(tmp_path / "data")])
     assert refused.exit_code == 1
     assert "names no object store" in refused.output

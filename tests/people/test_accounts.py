@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import re
-import sqlite3
 import unicodedata
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from service.people.person import ROLES, AccountError, LinkError, SignInRefusedError, may
 from service.people.sessions import People
-from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
 from tests.support.record.office import Office, refused
+from tests.support.record.outsider import outsider
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CrashingFiles
 
@@ -210,7 +208,7 @@ def test_no_secret_reaches_the_record_or_the_database_in_clear(office: Office) -
     office.people.accounts.change_password(person, "a password of tomorrow")
     office.people.accounts.change_pin(person, "97531")
     secrets |= {password_of("grace"), password_of("ada"), "a password of tomorrow", "97531", "135790", token, link}
-    with closing(sqlite3.connect(database_path(office.data))) as connection:
+    with outsider(office.data) as connection:
         tables = ("accounts", "sessions", "invitations", "events", "control")
         text = "\n".join(str(row) for table in tables for row in connection.execute(f"SELECT * FROM {table}"))
     # Short digit sequences occur in times and hashes by chance: search for a PIN as a separate value.

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import sqlite3
 from collections.abc import Generator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,12 +13,12 @@ from service.people.person import AccountError, Role, SignInRefusedError
 from service.people.sessions import KnownBy
 from service.people.tries import FREE_FAILURES
 from service.rig import load_rig
-from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.verification.verify import verify
 from tests.support.pages.at_the_table import left_at
 from tests.support.pages.web import PIN, Browser, WebSite, password_of, web_site
 from tests.support.processes.waiting import until
+from tests.support.record.outsider import outsider
 from tests.support.runs.bench_run import PROTOCOL, Bench
 
 BADGE = "0004711815"
@@ -157,7 +155,7 @@ def test_the_right_pin_gains_nobody_further_guesses_at_the_password(web: WebSite
 
 def test_a_badge_is_stored_hashed_and_told_without_itself(web: WebSite) -> None:
     assert enrol(web, "grace", BADGE) == 303
-    with closing(sqlite3.connect(database_path(web.site.data))) as connection:
+    with outsider(web.site.data) as connection:
         (stored,) = connection.execute("SELECT badge_hash FROM accounts WHERE account = 'grace'").fetchone()
     assert re.fullmatch(r"hmac-sha256:[0-9a-f]{16}:\$argon2id\$.*", stored)
     told = [e for e in web.store.events(SITE) if isinstance(e.payload, AccountChanged) and e.payload.field == "badge"]
@@ -170,11 +168,10 @@ def test_a_badge_is_stored_hashed_and_told_without_itself(web: WebSite) -> None:
 def test_a_badge_put_in_past_the_software_shows(web: WebSite) -> None:
     assert enrol(web, "grace", BADGE) == 303
     web.store.close()
-    with closing(sqlite3.connect(database_path(web.site.data))) as connection:
+    with outsider(web.site.data) as connection:
         connection.execute(
             "UPDATE accounts SET badge_hash = (SELECT badge_hash FROM accounts WHERE account = 'grace')"
         )
-        connection.commit()
     said = "\n".join(str(fault) for fault in verify(web.site.data).faults)
     assert "the badge of the account emmy was set past the software" in said
     assert "the badge of the account grace" not in said

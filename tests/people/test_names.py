@@ -40,6 +40,8 @@ from tests.support.record.entered_names import (
 from tests.support.record.office import Office
 from tests.support.record.stepped_clock import SteppedClock
 
+pytestmark = pytest.mark.sqlite("backups and journal: a server has its own")
+
 # One of each kind, for the tests that are quick: in turn, one at each place. The sweep takes all at every place.
 FEW = ("emmy\u200b", "\u0435mmy", "\x1b[2Jemmy", "runner", "A Stranger", "emmy\n")
 FEW_OF_NOBODY = ("emmy\u200b", "\u0435mmy", "\x1b[2Jemmy", "runner", "claimed:emmy")

@@ -69,6 +69,7 @@ def test_with_the_password_it_is_recorded(data: Path, tmp_path: Path) -> None:
     assert recorded_by(data, "lise")[-1] == "evidence_exported"
 
 
+@pytest.mark.sqlite("backups and journal: a server has its own")
 @pytest.mark.slow
 def test_a_backup_is_restored_in_the_name_of_an_account_with_its_password_only(data: Path, tmp_path: Path) -> None:
     backup, destination = tmp_path / "backup", tmp_path / "restored"

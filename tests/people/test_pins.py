@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,17 +12,17 @@ from service.people.person import PinRefusedError
 from service.people.sessions import People
 from service.store.backup.backup import BackupOptions, back_up
 from service.store.backup.restore import restore
-from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of
 from tests.support.record.office import Office
+from tests.support.record.outsider import outsider
 
 PEPPER = Path("keys", "pepper")
 
 
 def stored(data: Path, column: str) -> str:
-    with closing(sqlite3.connect(database_path(data))) as connection:
+    with outsider(data) as connection:
         (found,) = connection.execute(f"SELECT {column} FROM accounts WHERE account = 'grace'").fetchone()
     return str(found)
 
@@ -75,6 +73,7 @@ def test_without_its_key_a_pin_is_set_again_with_the_password(office: Office) ->
     people.unlock(grace, PIN)
 
 
+@pytest.mark.sqlite("backups and journal: a server has its own")
 def test_a_backup_holds_the_key_of_the_pins_with_the_other_keys_only(office: Office, tmp_path: Path) -> None:
     for keys in (False, True):
         report = back_up(office.data, tmp_path / "backup", BackupOptions(with_keys=keys), clock=office.clock)

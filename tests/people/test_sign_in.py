@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -17,9 +16,10 @@ from service.core.records.events import ServiceStarted, SignInRecorded
 from service.people.person import NotSignedInError, PinRefusedError
 from service.people.sessions import People
 from service.people.tries import failed_tries, wait_after_s
-from service.store.database.engine import SqliteDatabase, database_path
+from service.store.database.engine import SqliteDatabase
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused
+from tests.support.record.outsider import outsider
 
 
 def test_sign_in_and_out(office: Office) -> None:
@@ -185,7 +185,7 @@ def test_hashes_follow_the_parameters_of_today(office: Office, tmp_path: Path) -
     stronger = People(office.store, PasswordHasher(time_cost=2, memory_cost=16, parallelism=1))
     refused(lambda: stronger.sign_in("grace", "a wrong password"))
     stronger.sign_in("grace", password_of("grace"))
-    with closing(sqlite3.connect(database_path(office.data))) as connection:
+    with outsider(office.data) as connection:
         stored = dict(connection.execute("SELECT account, password_hash FROM accounts"))
         assert connection.execute("SELECT failures FROM accounts WHERE account = 'grace'").fetchone() == (0,)
     assert "m=16,t=2" in stored["grace"]

@@ -54,7 +54,8 @@ from service.store.verification.verify import verify
 from tests.support.pages.web import web_site
 from tests.support.processes.forked import Forked
 from tests.support.processes.waiting import until
-from tests.support.record.store import enqueue, rows
+from tests.support.record.outsider import rows
+from tests.support.record.store import enqueue
 from tests.support.recorded.registration_record import registration_record
 from tests.support.recorded.reported_run import evaluation
 from tests.support.rig.rig import REPOSITORY, command, orthocapture

@@ -15,6 +15,7 @@ import yaml
 
 from service.core.errors import OrthocaptureError
 from service.core.records.events import SessionStarted, ViewpointCaptured
+from service.store.database.opening import has_database
 from service.store.store import Store
 from tests.support.arms.arm_watch import watched_arm
 from tests.support.processes.started import started
@@ -98,7 +99,7 @@ def wait_for(reached: Callable[[], bool], runner: subprocess.Popen[bytes], log: 
 
 def recorded(data: Path, kind: type[T]) -> list[T]:
     """What the record holds of this kind so far, read in this process, which costs much less than a command."""
-    if not (data / "orthocapture.sqlite").exists():
+    if not has_database(data):
         return []
     try:
         with Store.open(data, create=False) as store:
@@ -115,7 +116,7 @@ def captured(data: Path) -> list[dict[str, Any]]:
 
 def events(data: Path) -> list[dict[str, Any]]:
     """The events so far, as an auditor reads them."""
-    if not (data / "orthocapture.sqlite").exists():
+    if not has_database(data):
         return []
     answer = orthocapture("audit", "show", "latest", "--data", str(data), "--json")
     if answer.returncode != 0:

@@ -83,6 +83,7 @@ def test_one_run_has_one_runner(bench: Bench) -> None:
     assert not bench.payloads(SessionStarted)
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_a_database_that_is_moved_away_in_the_capture_ends_the_run_loudly(tmp_path: Path) -> None:
     data = tmp_path / "data"
 
@@ -103,6 +104,7 @@ def test_a_database_that_is_moved_away_in_the_capture_ends_the_run_loudly(tmp_pa
     assert any(note.startswith("artefacts/") for note in report.notes), report.notes
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_a_write_ahead_log_that_is_cut_in_the_capture_ends_the_run_and_loses_nothing(
     tmp_path: Path,
 ) -> None:

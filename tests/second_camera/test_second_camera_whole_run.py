@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from service.store.store import Store
 from tests.support.ct.dicom_listener import dicom_listener
 from tests.support.pages.web import web_site
 from tests.support.protocols.small_demo import COARSE, VIEWS, small_demo
+from tests.support.record.outsider import copy_data
 from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import ended_run
 
@@ -257,7 +257,7 @@ def _seen(points_m: Array, T_world_camera: Transform) -> Array:
 
 
 def test_pages_show_every_camera(ended: Ended, tmp_path: Path) -> None:
-    shutil.copytree(ended.data, tmp_path / "data")
+    copy_data(ended.data, tmp_path / "data")
     with web_site(tmp_path) as site:
         browser, run = site.browser("auditor"), site.store.find_run("latest")
         capture = f"/runs/{run}/capture?step=viewpoint_capture_1"

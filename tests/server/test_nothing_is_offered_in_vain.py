@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Iterator
 from functools import lru_cache
 from html.parser import HTMLParser
@@ -16,6 +15,7 @@ import pytest
 from service.people.person import ROLES, Role, may
 from tests.support.pages.shown_site import ShownSite, shown_site
 from tests.support.pages.web import HOST, PIN, Browser, WebSite, password_of, web_site
+from tests.support.record.outsider import copy_data
 
 _PAGES_OF_A_RUN = (
     "/runs/{}", "/runs/{}/capture", "/runs/{}/scene", "/runs/{}/calibration", "/runs/{}/dataset", "/runs/{}/exports",
@@ -77,7 +77,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> ShownSite:
 @pytest.fixture
 def web(shown: ShownSite, tmp_path: Path) -> Iterator[WebSite]:
     """A copy of its own for each role, since what is offered is also done."""
-    with web_site(Path(shutil.copytree(shown.folder, tmp_path / "site"))) as made:
+    with web_site(copy_data(shown.folder, tmp_path / "site")) as made:
         for run_id in shown.under_way:
             made.site.launcher.start(run_id)
         yield made

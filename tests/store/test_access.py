@@ -79,6 +79,7 @@ def another_account_of_the_group() -> Generator[None]:
         os.setegid(before)
 
 
+@pytest.mark.sqlite("backups and journal: a server has its own")
 def test_whatever_is_made_is_its_owners_alone(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
     with web_site(tmp_path, clock=SteppedClock()) as site:

@@ -24,9 +24,12 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.forked import run
-from tests.support.record.store import Crash, CrashingFiles, capture, files_of, rows, start_run, tamper
+from tests.support.record.outsider import rows, tamper
+from tests.support.record.store import Crash, CrashingFiles, capture, files_of, start_run
 from tests.support.record.tampering import cut
 from tests.support.runs.bench_run import record_runs
+
+pytestmark = pytest.mark.sqlite("backups and journal: a server has its own")
 
 
 def ada(_folder: Path) -> str:

@@ -15,7 +15,7 @@ from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.timeout(400), pytest.mark.sqlite("backups and journal: a server has its own")]
 VIEWS = 12
 
 

@@ -30,9 +30,12 @@ from service.store.signatures.second_place import JournalCopy, SecondPlace, jour
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.outsider import rows, tamper
 from tests.support.record.stepped_clock import SteppedClock
-from tests.support.record.store import CountedIds, capture, enqueue, rows, start_run, tamper
+from tests.support.record.store import CountedIds, capture, enqueue, start_run
 from tests.support.record.tampering import cut
+
+pytestmark = pytest.mark.sqlite("backups and journal: a server has its own")
 
 WAL = f"{DATABASE_NAME}-wal"
 Meddle = Callable[[Path, Path], object]  # with the data folder, and one that holds its files as they were earlier

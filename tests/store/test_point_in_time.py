@@ -85,7 +85,7 @@ def test_a_site_is_restored_to_a_moment(archived: Cluster, tmp_path: Path) -> No
     assert status == 0, said
     archived.kill()
 
-    restored = Cluster(base)
+    restored = Cluster(base=base)
     restored.configure(
         {
             "restore_command": f"cp {archived.archive}/%f %p",

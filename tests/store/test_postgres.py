@@ -35,7 +35,11 @@ from tests.support.record.store import CountedIds, capture, start_run
 from tests.support.rig.rig import command
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
-pytestmark = [pytest.mark.packages("postgresql"), pytest.mark.timeout(300)]
+pytestmark = [
+    pytest.mark.packages("postgresql"),
+    pytest.mark.timeout(300),
+    pytest.mark.sqlite("compares the two databases by itself"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,9 @@ from service.store.records import SITE, NewArtefact, NewJob, UnknownRunError
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import show, verify
+from tests.support.record.outsider import outsider, rows, tamper
 from tests.support.record.stepped_clock import SteppedClock
-from tests.support.record.store import CountedIds, capture, enqueue, rows, start_run, tamper
+from tests.support.record.store import CountedIds, capture, enqueue, start_run
 
 RUN = "20261121-120000-000003"
 
@@ -120,7 +121,10 @@ SQL_TAMPERING = {
     "row of the index invented": (
         8,
         "of an event that is not there",
-        [f"INSERT INTO event_index (run_id, seq, kind, actor) VALUES ('{RUN}', 8, 'run_completed', 'runner')"],
+        [
+            f"INSERT INTO event_index (position, run_id, seq, kind, actor) "
+            f"SELECT max(position) + 1, '{RUN}', 8, 'run_completed', 'runner' FROM event_index"
+        ],
     ),
 }
 
@@ -215,6 +219,7 @@ def test_swapped_files_are_both_found(data: Path) -> None:
     assert [fault.seq for fault in verify(data).faults] == [2, 4]
 
 
+@pytest.mark.sqlite("SQLite's schema; tests/store/test_postgres.py alters PostgreSQL's")
 def test_missing_trigger_is_a_fault(data: Path) -> None:
     with closing(sqlite3.connect(database_path(data))) as connection:
         connection.execute("DROP TRIGGER events_no_update")
@@ -223,6 +228,7 @@ def test_missing_trigger_is_a_fault(data: Path) -> None:
     assert "events_no_update" in fault.what
 
 
+@pytest.mark.sqlite("SQLite's schema; tests/store/test_postgres.py alters PostgreSQL's")
 @pytest.mark.parametrize(
     "statements",
     [
@@ -244,6 +250,7 @@ def test_a_schema_that_is_not_ours_is_a_fault(data: Path, statements: list[str])
     assert "software" in fault.what or "missing" in fault.what
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_an_index_that_finds_nothing_is_a_fault(data: Path) -> None:
     """Emptied under another definition, which is then put back: SQLite's quick_check does not see it."""
     made = "CREATE INDEX jobs_open ON jobs (state, position)"
@@ -261,14 +268,14 @@ def test_an_index_that_finds_nothing_is_a_fault(data: Path) -> None:
 def test_an_account_that_nobody_made_is_a_fault(data: Path) -> None:
     columns = "account, full_name, role, state, password_hash, pin_hash, failures, locked_until_utc_s, created_utc"
     values = "'eve', 'Eve', 'administrator', 'active', 'x', '', 0, 0.0, '2026-11-21T12:00:00.250000Z'"
-    with closing(sqlite3.connect(database_path(data))) as connection:
+    with outsider(data) as connection:
         connection.execute(f"INSERT INTO accounts ({columns}) VALUES ({values})")
-        connection.commit()
     fault = verify(data).first_fault
     assert fault is not None
     assert "account eve (administrator) was made by nobody" in fault.what
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 @pytest.mark.slow
 def test_no_flipped_bit_ends_in_anything_but_a_report_or_an_error_of_ours(data: Path) -> None:
     path = database_path(data)
@@ -335,6 +342,7 @@ def test_verify_and_show_change_nothing(data: Path) -> None:
     assert after == before
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_truncated_database_is_an_error_with_advice(data: Path) -> None:
     path = database_path(data)
     path.write_bytes(path.read_bytes()[:9000])

@@ -7,10 +7,9 @@ import json
 import logging
 import os
 import re
-import sqlite3
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import typer
@@ -25,12 +24,14 @@ from service.core.errors import ConfigurationError
 from service.core.records.events import DeviceTrouble, OperatorAction, StepNote
 from service.core.shown_text import shown
 from service.logs.terminal import EscapingFormatter
+from service.store.database.tables import metadata
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.store import Store
 from tests.support.hostile_text import HOSTILE
 from tests.support.pages.web import Browser
 from tests.support.processes.waiting import until
+from tests.support.record.outsider import rows
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 # --- places that print ---------------------------------------------------------------------------------------------
@@ -194,12 +195,9 @@ def can_be_stored_as(place: str, text: str) -> bool:
 
 def refused_by_other_databases(data: Path) -> bool:
     """Return whether any row holds NUL or a surrogate, because of which a copy to PostgreSQL would be refused."""
-    with closing(sqlite3.connect(data / "orthocapture.sqlite")) as database:
-        # The index of words keeps no text that could be read back.
-        listed_ = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'event_words%'"
-        tables = [name for (name,) in database.execute(listed_)]
-        rows = "\n".join(repr(row) for name in tables for row in database.execute(f'SELECT * FROM "{name}"'))
-    return "\\x00" in rows.replace("\\\\x00", "") or "\\\\u0000" in rows.replace("\\\\\\\\u0000", "")
+    # The index of words keeps no text that could be read back.
+    found = "\n".join(repr(row) for table in metadata.tables for row in rows(data, f"SELECT * FROM {table}"))
+    return "\\x00" in found.replace("\\\\x00", "") or "\\\\u0000" in found.replace("\\\\\\\\u0000", "")
 
 
 # --- a record of nothing else --------------------------------------------------------------------------------------

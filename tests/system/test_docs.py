@@ -194,6 +194,7 @@ RUN_ELSEWHERE = {
         "tests/code_rules/test_suite_rules.py::"
         "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
     ),
+    "make test-postgres": "tests/store/test_store_crash.py::test_crash_at_every_point_of_a_record",
     **dict.fromkeys(
         ("make marks", "make marks FILES=tests/core"),
         "tests/code_rules/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
@@ -373,6 +374,12 @@ RUN_ELSEWHERE = {
         ),
         "tests/browser/whole_runs/test_browser_first_hour.py::"
         "test_the_tutorial_and_the_readme_lead_to_a_verified_run",
+    ),
+    "orthocapture store copy runs site-folder --run latest": (
+        "tests/store/test_moving.py::test_a_run_goes_to_another_record_and_back_with_every_number_the_same"
+    ),
+    "orthocapture audit sign-here --data runs": (
+        "tests/store/test_who_signs.py::test_signing_is_handed_over_with_key_and_log"
     ),
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"

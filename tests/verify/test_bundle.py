@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import json
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -24,6 +23,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.bundled_site import Site, check, record, run_verifier
+from tests.support.record.outsider import copy_data
 from tests.support.runs.bench_run import PROTOCOL
 
 # --- an untouched bundle ---------------------------------------------------------------------------------
@@ -118,7 +118,7 @@ def test_the_same_evidence_gives_the_same_bytes(site: Site, tmp_path: Path) -> N
     with Store.open(site.data.with_name("before")) as store:
         checkpoint(store, "site")
     for name in ("one", "two"):
-        shutil.copytree(site.data.with_name("before"), tmp_path / name)
+        copy_data(site.data.with_name("before"), tmp_path / name)
         report = bundle_report(tmp_path / name, site.run_id, with_pictures=True)
         with Store.open(tmp_path / name) as store:
             target = tmp_path / f"{name}.zip"
@@ -162,7 +162,7 @@ def test_without_its_one_package_the_verifier_says_so() -> None:
 
 def test_altered_evidence_is_not_exported(site: Site, tmp_path: Path) -> None:
     data = tmp_path / "data"
-    shutil.copytree(site.data, data)
+    copy_data(site.data, data)
     with Store.open(data) as store:
         image = next(item for item in store.artefacts(site.run_id) if item.ref.kind == "image")
         path = store.artefact_path(image.ref.sha256)
@@ -194,7 +194,7 @@ def test_nothing_is_overwritten_and_nothing_half_written_stays(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = tmp_path / "data"
-    shutil.copytree(site.data, data)
+    copy_data(site.data, data)
     (tmp_path / "b-SIMULATED.zip").write_text("mine")
     with Store.open(data) as store:
         with pytest.raises(DataError, match="exists"):
@@ -215,7 +215,7 @@ def test_nothing_is_overwritten_and_nothing_half_written_stays(
 
 def test_the_command_exports_and_says_how_to_verify(site: Site, tmp_path: Path) -> None:
     data = tmp_path / "data"
-    shutil.copytree(site.data, data)
+    copy_data(site.data, data)
     words = ["export", "latest", str(tmp_path / "b.zip"), "--data", str(data), "--hashes-only", "--operator", "ada"]
     done = CliRunner().invoke(audit_app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.output

@@ -31,9 +31,10 @@ from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.counting import lines_of
+from tests.support.record.outsider import INDEX_AGAIN, tamper
 from tests.support.record.stepped_clock import SteppedClock
-from tests.support.record.store import CountedIds, capture, start_run, tamper
-from tests.support.record.tampering import INDEX_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
+from tests.support.record.store import CountedIds, capture, start_run
+from tests.support.record.tampering import cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 
@@ -178,6 +179,7 @@ def test_nothing_is_signed_after_it(data: Path, attack: Callable[[Path], None]) 
         sign_again(data)
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_a_database_put_back_as_it_was_shows(data: Path, tmp_path: Path) -> None:
     with Store.open(data) as store:
         store.database.close()

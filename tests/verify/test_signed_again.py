@@ -15,8 +15,8 @@ from service.store.signatures.log import NAME
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import rows, tamper
-from tests.support.record.tampering import INDEX_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
+from tests.support.record.outsider import INDEX_AGAIN, rows, tamper
+from tests.support.record.tampering import cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 UNSIGNED = PROTOCOL.replace(

@@ -23,9 +23,10 @@ from service.store.signatures.checkpoints import KeyFolder, signed_by, statement
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.outsider import INDEX_AGAIN, rows, tamper
 from tests.support.record.stepped_clock import SteppedClock
-from tests.support.record.store import CountedIds, capture, rows, start_run, tamper
-from tests.support.record.tampering import INDEX_AGAIN, alter_row, journal_anew, rewrite_to_the_end
+from tests.support.record.store import CountedIds, capture, start_run
+from tests.support.record.tampering import alter_row, journal_anew, rewrite_to_the_end
 
 ROOT_DIR = Path(__file__).parents[2]
 RUN = "20261121-120000-000003"

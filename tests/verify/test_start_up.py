@@ -16,8 +16,9 @@ from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.outsider import tamper
 from tests.support.record.stepped_clock import SteppedClock
-from tests.support.record.store import CountedIds, capture, start_run, tamper
+from tests.support.record.store import CountedIds, capture, start_run
 
 
 class Clocks(SteppedClock):

@@ -7,7 +7,6 @@ import hashlib
 import json
 import random
 import re
-import shutil
 import struct
 import zipfile
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from service.store.artefacts import hash_file
 from service.store.signatures.signing import public_keys, rotate_key
 from service.store.store import Store
 from tests.support.record.bundled_site import Site, check, record, run_verifier
+from tests.support.record.outsider import copy_data
 
 RECORDS = ("events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl", "checkpoints.jsonl", "keys.jsonl")
 
@@ -224,7 +224,7 @@ def test_a_forged_site_is_found_by_its_fingerprint_only(site: Site, tmp_path: Pa
 
 def test_a_lost_key_breaks_the_line_of_fingerprints(site: Site, tmp_path: Path) -> None:
     data = tmp_path / "data"
-    shutil.copytree(site.data, data)
+    copy_data(site.data, data)
     with Store.open(data) as store:
         next((data / "keys").iterdir()).unlink()
         rotate_key(store, reason="disk died", actor="ada", lost=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 from contextlib import closing, suppress
 from pathlib import Path
@@ -22,8 +21,9 @@ from service.store.signatures.timestamps import Authority, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
+from tests.support.record.outsider import copy_data, rows, tamper
 from tests.support.record.stepped_clock import SteppedClock
-from tests.support.record.store import capture, enqueue, rows, start_run, tamper
+from tests.support.record.store import capture, enqueue, start_run
 from tests.support.record.time_stamp_authority import time_stamp_authority
 
 
@@ -56,7 +56,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def data(recorded: Path, tmp_path: Path) -> Path:
-    shutil.copytree(recorded, tmp_path / "data")
+    copy_data(recorded, tmp_path / "data")
     return tmp_path / "data"
 
 
@@ -168,6 +168,7 @@ def test_what_was_put_in_past_the_software_is_named(data: Path, name: str) -> No
     assert any(said in fault for fault in faults(data)), faults(data)
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_words_that_are_there_and_cannot_be_found_are_a_fault(data: Path) -> None:
     words = {f"word{i}": f"{i * 7919 % 100_003:x}" for i in range(3000)}  # more than fits into one page of the index
     with Store.open(data) as store:
@@ -178,6 +179,7 @@ def test_words_that_are_there_and_cannot_be_found_are_a_fault(data: Path) -> Non
     assert fault.startswith("orthocapture.sqlite: the index by which auditors search is damaged: a search for")
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_commits_behind_a_damaged_frame_of_the_write_ahead_log_are_missed(data: Path) -> None:
     wal = data / "orthocapture.sqlite-wal"
     with Store.open(data) as store:
@@ -211,12 +213,14 @@ def test_commits_behind_a_damaged_frame_of_the_write_ahead_log_are_missed(data: 
     assert altered(20) == ([f"{wal.name}: its head is damaged: what was committed last is lost"], [])
 
 
+@pytest.mark.sqlite("SQLite's schema; tests/store/test_postgres.py alters PostgreSQL's")
 def test_a_number_of_the_database_that_this_software_never_sets_is_a_fault(data: Path) -> None:
     with closing(sqlite3.connect(database_path(data))) as connection:
         connection.execute("PRAGMA application_id = 7")
     assert faults(data) == ["orthocapture.sqlite: its application_id is 7: this software leaves it 0"]
 
 
+@pytest.mark.sqlite("backups and journal: a server has its own")
 def test_the_number_of_the_journals_line_cannot_be_changed_in_the_database(data: Path) -> None:
     for number, said in ((7, "it holds line 7 of journal.jsonl, which has"), (9999, "it ends at line")):
         with closing(sqlite3.connect(database_path(data))) as connection:
@@ -224,6 +228,7 @@ def test_the_number_of_the_journals_line_cannot_be_changed_in_the_database(data:
         assert any(said in fault for fault in faults(data))
 
 
+@pytest.mark.sqlite("SQLite's schema; tests/store/test_postgres.py alters PostgreSQL's")
 def test_a_trigger_on_another_table_is_not_ours(data: Path) -> None:
     with closing(sqlite3.connect(database_path(data))) as connection:
         connection.execute("PRAGMA writable_schema = ON")
@@ -232,6 +237,7 @@ def test_a_trigger_on_another_table_is_not_ours(data: Path) -> None:
     assert any("the trigger runs_no_update is not the one" in fault for fault in faults(data))
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_a_row_that_its_own_table_forbids_is_refused_in_words(data: Path) -> None:
     with closing(sqlite3.connect(database_path(data), isolation_level=None)) as connection:
         connection.execute("PRAGMA writable_schema = ON")
@@ -325,6 +331,7 @@ def rewrite_schema(data: Path, table: str, old: str, new: str) -> None:
         connection.commit()
 
 
+@pytest.mark.sqlite("SQLite's schema; tests/store/test_postgres.py alters PostgreSQL's")
 @pytest.mark.parametrize(
     ("table", "column"), [("jobs", "position"), ("event_index", "seq"), ("event_index", "run_id")]
 )

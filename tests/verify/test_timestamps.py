@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.signatures.timestamps import Authority, stamp_end, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import rows, tamper
+from tests.support.record.outsider import copy_data, rows, tamper
 from tests.support.record.tampering import journal_anew
 from tests.support.record.time_stamp_authority import (
     TimeStampAuthority,
@@ -53,7 +52,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @pytest.fixture
 def data(recorded: tuple[Path, str], tmp_path: Path) -> Path:
-    shutil.copytree(recorded[0], tmp_path / "data")
+    copy_data(recorded[0], tmp_path / "data")
     return tmp_path / "data"
 
 

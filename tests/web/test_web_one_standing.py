@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from html import unescape
-from pathlib import Path
 
 import pytest
 
@@ -20,6 +18,7 @@ from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import ShownSite, shown_site
 from tests.support.pages.states import BEGUN
 from tests.support.pages.web import WebSite, web_site
+from tests.support.record.outsider import copy_data
 
 _PAGES = ("", "/capture", "/scene", "/calibration", "/dataset")
 _STATES = (
@@ -68,7 +67,7 @@ class Shown:
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
     recorded: ShownSite = shown_site(tmp_path_factory.mktemp("stands"))
-    folder = Path(shutil.copytree(recorded.folder, tmp_path_factory.mktemp("stands") / "site"))
+    folder = copy_data(recorded.folder, tmp_path_factory.mktemp("stands") / "site")
     with web_site(folder) as web:
         runs = {name: str(getattr(recorded, name)) for name in _STATES[:8]}
         runs |= {name: web.begin_run().run_id for name in ("paused", "died", "aborted", *_ROBOTS)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 
-from sqlalchemy import Column, ColumnElement, Connection, DateTime, Double, cast, extract, func, text
+from sqlalchemy import Column, ColumnElement, Connection, DateTime, Double, Engine, cast, extract, func, text
 
 from service.store.durable_effects import Clock
 
@@ -52,6 +52,10 @@ class Database(ABC):
     @abstractmethod
     def require_in_place(self) -> None:
         """Raise StoreError unless the database is still the one that was opened."""
+
+    def listening_engine(self) -> Engine | None:
+        """Return what opens connections that hear of changes; None where one can only poll."""
+        return None
 
     @abstractmethod
     def close(self) -> None:

@@ -24,20 +24,22 @@ from service.store.durable_effects import Files
 from service.store.records import StoreVersionError
 
 _LOG = logging.getLogger(__name__)
-_WRITERS = 0x6F727468  # the advisory lock that writers hold; any number that nobody else uses
-_LOCK_TIMEOUT_S = 30  # of one wait for another writer; then a warning is logged
+WRITERS = 0x6F727468  # the advisory lock that writers hold; any number that nobody else uses
+LOCK_TIMEOUT_S = 30  # of one wait for another writer; then a warning is logged
 _HUNG_S = 120  # a client that does nothing within a transaction for so long loses it, so that a site goes on
 _AGAIN_S = 0.5
 _LOCK_NOT_AVAILABLE = "55P03"
 _COMMITTED, _ABORTED = "committed", "aborted"
 LOOK = "Look at the database server: does it run, can this machine reach it, has it room? What was recorded is safe"
 
+HUNG = "Another process has held the database for too long; look for one that hangs"
+
 
 def engine_for(url: str) -> Engine:
     """Return an engine for the address of a PostgreSQL database. Raises StoreError, ConfigurationError."""
     try:
         address = make_url(url).set(drivername="postgresql+psycopg")
-        options = f"-c lock_timeout={_LOCK_TIMEOUT_S}s -c idle_in_transaction_session_timeout={_HUNG_S}s"
+        options = f"-c lock_timeout={LOCK_TIMEOUT_S}s -c idle_in_transaction_session_timeout={_HUNG_S}s"
         return create_engine(address, connect_args={"options": options, "connect_timeout": 10}, pool_pre_ping=True)
     except (ArgumentError, NoSuchModuleError) as error:
         raise StoreError(
@@ -94,7 +96,7 @@ class PostgresDatabase(Database):
         began_s = time.monotonic()
         while True:
             try:
-                connection.execute(text("SELECT pg_advisory_xact_lock(:writers)"), {"writers": _WRITERS})
+                connection.execute(text("SELECT pg_advisory_xact_lock(:writers)"), {"writers": WRITERS})
             except DBAPIError as error:
                 connection.rollback()
                 waited_s = time.monotonic() - began_s
@@ -137,6 +139,10 @@ class PostgresDatabase(Database):
         """Raise StoreError unless the server answers."""
         with self.reading() as connection:
             connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
+
+    def listening_engine(self) -> Engine | None:
+        """Return the engine, from which a connection is taken for good."""
+        return self._engine
 
     def close(self) -> None:
         """Close all connections."""
@@ -223,7 +229,10 @@ def _store_errors(where: str) -> Generator[None]:
     try:
         yield
     except DBAPIError as error:
-        raise StoreError(f"the database refused: {_first_line(error.orig)}", where=where, remedy=LOOK) from error
+        late = getattr(error.orig, "sqlstate", "") == _LOCK_NOT_AVAILABLE
+        raise StoreError(
+            f"the database refused: {_first_line(error.orig)}", where=where, remedy=HUNG if late else LOOK
+        ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=where, remedy=LOOK) from error
 

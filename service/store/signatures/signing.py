@@ -9,10 +9,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from sqlalchemy import Connection, select
 
 from service.core.records.events import KeyChanged, Payload, RunSigned, SignaturesWrittenAgain
+from service.store.database.database import is_postgres
 from service.store.database.tables import event_index, events, runs
 from service.store.durable_effects import utc_text
 from service.store.events import read_head, to_event
-from service.store.records import SITE, Checkpoint, SigningKeyError, UnknownRunError
+from service.store.records import SITE, Checkpoint, SigningKeyError, SignsElsewhereError, UnknownRunError
 from service.store.signatures.checkpoints import (
     KeyFolder,
     artefacts_digest,
@@ -26,6 +27,7 @@ from service.store.signatures.checkpoints import (
     statement,
 )
 from service.store.signatures.log import SeenSignatures
+from service.store.signatures.signer import named_signer, require_signer, this_signer
 from service.store.store import Store
 from service.store.verification.soundness import require_sound
 
@@ -58,6 +60,7 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
         StoreError: the log of signatures cannot be written.
     """
     log, seen = store.signature_log, store.seen_signatures
+    require_signs_here(store)
     if run_id not in store.sound_until:
         _look(store, run_id)  # the first time takes long, and keeps nobody waiting
     with log.alone():
@@ -84,6 +87,47 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
     return signed
 
 
+def checkpoint_here(store: Store, run_id: str) -> Checkpoint | None:
+    """Do as `checkpoint` if this data folder signs; otherwise do nothing and return None: the one that does will."""
+    try:
+        return checkpoint(store, run_id)
+    except SignsElsewhereError:
+        return None
+
+
+def require_signs_here(store: Store) -> None:
+    """Raise SignsElsewhereError if another data folder of the site signs."""
+    with store.database.reading() as connection:
+        require_signer(connection, store.database_path.parent)
+
+
+def sign_here(store: Store, *, actor: str) -> Checkpoint:
+    """Let this data folder sign the site from now on; it must have the key in use and the whole log of signatures.
+
+    Raises:
+        IntegrityError: the site's chain or the log does not verify.
+        SigningKeyError: the key is not here, or the log is not that of the last signature.
+    """
+    data_dir = store.database_path.parent
+    log, seen = store.signature_log, store.seen_signatures
+    with log.alone(), store.database.writing() as connection:
+        if not is_postgres(connection):
+            raise SigningKeyError("this folder's record is its own, and so is its signing key", where=str(data_dir))
+        seen.look(connection)
+        require_sound(store, connection, SITE)
+        if not seen.key_id:
+            raise SigningKeyError("nothing was signed yet: whoever signs first will sign", where=str(data_dir))
+        KeyFolder(data_dir, store.files).load(seen.key_id)
+        if seen.missing:
+            raise SigningKeyError(
+                f"the log of signatures here misses {len(seen.missing)} of them",
+                where=str(log.path),
+                remedy="End the processes of the folder that signs now, then copy its signatures.jsonl here",
+            )
+        store.append_site(connection, [this_signer(data_dir, seen.key_id)], actor=actor)
+    return checkpoint(store, SITE)
+
+
 def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> PublicKey:
     """Replace the signing key. The old key finally signs the KeyChanged of the new one and is then destroyed.
 
@@ -99,6 +143,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
     """
     folder = KeyFolder(store.database_path.parent, store.files)
     log, seen = store.signature_log, store.seen_signatures
+    require_signs_here(store)
     with log.alone():
         with store.database.reading() as connection:
             seen.look(connection)
@@ -219,16 +264,23 @@ def _require_lost(connection: Connection, folder: KeyFolder) -> None:
 
 def _present_key(store: Store, connection: Connection) -> Ed25519PrivateKey:
     """Return the key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
-    folder = KeyFolder(store.database_path.parent, store.files)
+    data_dir = store.database_path.parent
+    folder = KeyFolder(data_dir, store.files)
+    require_signer(connection, data_dir)  # another folder may have taken over since the look
     key_id = store.seen_signatures.key_in_use(connection)
     if key_id:
         key = folder.load(key_id)
         folder.destroy_all_but(key_id)  # keys left by a crash during a replacement
+        if is_postgres(connection) and named_signer(connection) is None:  # an earlier version signed
+            store.append_site(connection, [this_signer(data_dir, key_id)], actor=_ACTOR)
         return key
     # A crash before the commit leaves a key file without its event; use that key.
     left = folder.present()
     key = folder.load(left[0]) if left else folder.make()
     _record_key(store, connection, key, previous="", reason="first signature", actor=_ACTOR)
+    if is_postgres(connection):
+        named = this_signer(data_dir, key_fingerprint(public_bytes(key)))
+        store.append_site(connection, [named], actor=_ACTOR)
     _sign(store, connection, SITE, key)
     return key
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sqlalchemy import Connection
 
-from service.core.errors import StoreError
+from service.core.errors import IntegrityError, StoreError
 from service.store.artefacts import read_artefacts
 from service.store.database.database import Database, is_postgres
 from service.store.database.engine import DATABASE_NAME, RESTORE, database_path
@@ -25,6 +25,7 @@ from service.store.runs import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import LogLine, log_findings, read_log, written_again_findings
 from service.store.signatures.second_place import copy_faults
+from service.store.signatures.signer import in_another_place, signer_elsewhere
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import postgres_checks, search_checks
@@ -223,7 +224,18 @@ def _verify(
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
     notes += elsewhere_notes((files or {}).values())
-    of_log, said_of_log = _log_findings(outside.lines, evidence, site, keys, run_id)
+    named = None
+    if outside.lines is None:
+        with suppress(IntegrityError):  # an event that was altered is a fault of its chain
+            named = signer_elsewhere(connection, data_dir)
+    if named is not None and in_another_place(named, data_dir):
+        of_log: list[Fault] = []
+        where = f"the log of signatures is in {named.folder} on {named.host}"
+        said_of_log = [f"{where}: a verification there reads it"]
+        if isinstance(outside.anchors, ReadAnchors):  # of the lines that are not here
+            outside = replace(outside, anchors=UnreadAnchors(outside.anchors.place, where))
+    else:
+        of_log, said_of_log = _log_findings(outside.lines, evidence, site, keys, run_id)
     every_run = run_id is None
     anchored, unread = _anchor_findings(outside, chains, keys, evidence, every_run=every_run)
     unread = (*unread_files((files or {}).values()), *unread)

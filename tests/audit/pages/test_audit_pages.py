@@ -15,7 +15,7 @@ from service.store.verification.verify import verify
 from service.web.audit import evidence, overview, pages
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
-from tests.support.record.store import rows, tamper
+from tests.support.record.outsider import rows, tamper
 from tests.support.recorded.large_run import digest_of
 from tests.support.runs.recorded_run import record_run
 

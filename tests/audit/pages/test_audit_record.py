@@ -27,7 +27,7 @@ from service.store.records import UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until
-from tests.support.record.store import tamper
+from tests.support.record.outsider import tamper
 from tests.support.recorded.large_run import SMALL, Sizes, digest_of, write_large_run
 from tests.support.runs.recorded_run import record_run
 

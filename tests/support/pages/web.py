@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -29,6 +28,7 @@ from service.web.site import Launcher, Site
 from tests.support.pages.compiled_templates import keep_compiled_templates
 from tests.support.processes.forked import pages_fork
 from tests.support.processes.quick_hashes import QuickHasher
+from tests.support.record.outsider import copy_data
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
 
@@ -165,7 +165,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
     (protocols / "bench.yaml").write_text(PROTOCOL)
     data = folder / "data"
     if clock is None and not data.exists():
-        shutil.copytree(Path(_with_people().name) / "data", data)
+        copy_data(Path(_with_people().name) / "data", data)
     clock = clock or SteppedClock.from_now()
     with Store.open(data, clock) as store, start_blocking_portal() as portal, pages_fork():
         people = People(store, QUICK_HASHES)

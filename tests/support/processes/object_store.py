@@ -19,6 +19,7 @@ from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreError
 from service.store.objects.s3 import S3Objects
 from service.store.objects.signed_requests import SignedRequests, StoreKeys
+from tests.support.record.outsider import write_site_file
 
 KEYS = StoreKeys("test-access", "test-secret")
 REGION = "us-east-1"
@@ -125,7 +126,7 @@ class Weed:
         )
         section: dict[str, object] = {"url": f"s3://{bucket}/{prefix}", "endpoint": self.endpoint, "keys": keys.name}
         section |= {} if lock_days is None else {"lock_days": lock_days}
-        (data / "site.yaml").write_text(yaml.safe_dump({"object_store": section, "spool": spool}))
+        write_site_file(data, {"object_store": section, "spool": spool})
         return self.objects(bucket, prefix)
 
     def kill(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -15,6 +14,7 @@ from service.audit.verify import bundle_verifier
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.store import Store
+from tests.support.record.outsider import copy_data
 from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
@@ -48,7 +48,7 @@ def record(folder: Path, protocol: str = PROTOCOL) -> tuple[Path, str]:
 def bundled_site(folder: Path) -> Site:
     """Make the run and its bundle in an empty folder."""
     data, run_id = record(folder)
-    shutil.copytree(data, folder / "before")
+    copy_data(data, folder / "before")
     with Store.open(data) as store:
         made = export_bundle(store, run_id, folder / "bundle.zip", actor="ada")
     with zipfile.ZipFile(made.path) as archive:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import chdir
@@ -26,6 +25,7 @@ from service.store.store import Store
 from simulators.sony_camera.exif import PLATE
 from simulators.still_camera.exif import Shot, encode_jpeg
 from tests.support.pages.web import PIN, QUICK_HASHES, WebSite, web_site
+from tests.support.record.outsider import copy_data
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 from tests.support.runs.import_folder import SETTINGS
@@ -74,6 +74,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "accounts end-wait": ("accounts", "end-wait", "emmy"),
     "audit rotate-key": ("audit", "rotate-key", "--reason", "yearly"),
+    "audit sign-here": ("audit", "sign-here"),
     "audit export": ("audit", "export", "latest", "made.zip", "--hashes-only"),
     "audit report": ("audit", "report", "latest", "--html", "made.html"),
     "audit release": ("audit", "release", "--yes"),
@@ -150,7 +151,7 @@ class NamedSite:
                 status, refusal = _called(words, name, password)
                 since = tuple(path.name for path in made.iterdir()) if made.is_dir() else ()
             elif place == "store rebuild":  # there is something to rebuild only where the journal was lost
-                shutil.copytree(self.data, made)
+                copy_data(self.data, made)
                 (made / JOURNAL_NAME).write_bytes(b"")
                 status, refusal = _called([*words, "--data", str(made)], name, password)
                 since = ("a journal",) if (made / JOURNAL_NAME).stat().st_size else ()

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
-import sqlite3
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 
 from service.core.records.events import ArtefactRef, RunStarted, ViewpointCaptured
-from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
-from service.store.event_index import facets_of, words_of
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.store import Store
 
@@ -221,34 +216,6 @@ def capture(store: Store, run_id: str, viewpoint: str) -> ArtefactRef:
         artefacts=[NewArtefact(ref, "camera", "capture", 1, viewpoint, "Ada")],
     )
     return ref
-
-
-def rows(data_dir: Path, sql: str) -> list[tuple[object, ...]]:
-    """Query with plain sqlite3, as an outsider would."""
-    with closing(sqlite3.connect(database_path(data_dir))) as connection:
-        return list(connection.execute(sql))
-
-
-def know_index(connection: sqlite3.Connection) -> None:
-    """Give SQL the functions by which the index of events is made: words_of(actor, payload), facets_of(payload)."""
-    connection.create_function("words_of", 2, lambda actor, payload: words_of(actor, json.loads(payload)))
-    connection.create_function("facets_of", 1, lambda payload: json.dumps(dict(facets_of(json.loads(payload)))))
-
-
-def tamper(data_dir: Path, *statements: str) -> None:
-    """Change evidence as somebody with full access would: drop the triggers first, and restore them afterwards."""
-    with closing(sqlite3.connect(database_path(data_dir))) as connection:
-        know_index(connection)
-        triggers: list[tuple[str, str]] = list(
-            connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'")
-        )
-        for name, _sql in triggers:
-            connection.execute(f"DROP TRIGGER {name}")
-        for statement in statements:
-            connection.execute(statement)
-        for _name, sql in triggers:
-            connection.execute(sql)
-        connection.commit()
 
 
 def files_of(data_dir: Path) -> Iterator[Path]:

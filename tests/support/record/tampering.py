@@ -9,28 +9,21 @@ from typing import Any
 
 from service.store.artefacts import record_sha256
 from service.store.database.engine import database_path
+from service.store.database.tables import artefacts
 from service.store.durable_effects import DurableFiles
 from service.store.events import event_sha256, parse_canonical
 from service.store.journal.changes import every_row
 from service.store.journal.journal import Journal
 from service.store.journal.lines import NAME
-from tests.support.record.store import rows, tamper
+from tests.support.record.outsider import INDEX_AGAIN, is_postgres, rows, tamper
 
-# Writes facets and words of the present events again, with the functions of `know_index`; tamper() has dropped the
-# triggers before this runs.
-INDEX_AGAIN = (
-    "DELETE FROM event_facets",
-    "INSERT INTO event_facets SELECT e.run_id, e.seq, f.key, f.value "
-    "FROM events AS e JOIN json_each(facets_of(e.payload)) AS f",
-    "INSERT INTO event_words (event_words) VALUES ('delete-all')",
-    "INSERT INTO event_words (rowid, words) SELECT i.position, words_of(e.actor, e.payload) "
-    "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq ORDER BY i.position",
-)
 _EVENT: tuple[str, ...] = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256", "payload", "sha256")
 
 
 def journal_anew(data: Path) -> None:
     """Make the journal anew, as a forger does who can write it too, so that it fits the database as it is."""
+    if is_postgres(data):  # a server keeps its own
+        return
     (data / NAME).unlink(missing_ok=True)
     with closing(sqlite3.connect(database_path(data), isolation_level=None)) as connection:
         tail = Journal(data, DurableFiles()).begin(every_row(connection), 0)
@@ -66,10 +59,9 @@ def rewrite_to_the_end(data: Path, run_id: str, seq: int, **changes: Any) -> Non
 
 
 def _rows_again(data: Path, where: str, event: str) -> list[str]:
-    names = [str(row[1]) for row in rows(data, "PRAGMA table_info(artefacts)")]
     changed: list[str] = []
     for row in rows(data, f"SELECT * FROM artefacts WHERE {where}"):
-        fields = dict(zip(names, row, strict=True))
+        fields = dict(zip(artefacts.columns.keys(), row, strict=True))
         digest = record_sha256(event, fields)
         changed.append(
             f"UPDATE artefacts SET record_sha256 = '{digest}' WHERE {where} AND position = {fields['position']}"

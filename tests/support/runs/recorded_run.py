@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,6 +31,7 @@ from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from tests.support.record.outsider import copy_data
 from tests.support.record.store import enqueue
 from tests.support.runs.computing_run import compute_jobs
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, exact_outlines, scene
@@ -85,7 +85,7 @@ def record_run(folder: Path, *, complete: bool = True, version: int = 1, protoco
     if (folder / "data").exists():
         return _record(folder, complete=complete, version=version, protocol=protocol)
     recorded, run_id = _recorded(complete=complete, version=version, protocol=protocol)
-    shutil.copytree(recorded.name, folder, dirs_exist_ok=True)
+    copy_data(Path(recorded.name), folder)
     return run_id
 
 

@@ -53,9 +53,12 @@ from service.core.records.events.site import (
     ProtocolApproved,
     RecordCopied,
     RecordRebuilt,
+    RunMoved,
+    RunReceived,
     RunSigned,
     ServiceStarted,
     SignaturesWrittenAgain,
+    SignerNamed,
     SignInRecorded,
     SiteOpened,
     TimeStampKept,
@@ -108,7 +111,10 @@ Payload = Annotated[
     | ProtocolApproved
     | DataRestored
     | RecordRebuilt
-    | RecordCopied,
+    | RecordCopied
+    | RunMoved
+    | RunReceived
+    | SignerNamed,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

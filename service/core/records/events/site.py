@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.core.records.base import Record
+from service.core.records.base import ArtefactRef, Record
 from service.core.records.events.operator import Identified, OperatorVerb
 
 
@@ -67,6 +67,16 @@ class KeyChanged(Record):
     public_key: str  # base64 of the 32 raw bytes (RFC 8032)
     previous_key_id: str  # "" for the first
     reason: str
+
+
+class SignerNamed(Record):
+    """The data folder that signs from here on, where several folders share the database of a site."""
+
+    kind: Literal["signer_named"] = "signer_named"
+    signer: str  # the folder's random name, in its file `signer`
+    key_id: str  # the key in use
+    host: str
+    folder: str
 
 
 class LeftoversRemoved(Record):
@@ -149,6 +159,31 @@ class RecordCopied(Record):
     events: int  # events of all chains
     files: int
     heads_sha256: str  # of the canonical JSON of {chain: SHA-256 of its last event}, the same in both
+
+
+class RunMoved(Record):
+    """A run goes on in another record; nothing is appended to its chain here until it comes back."""
+
+    kind: Literal["run_moved"] = "run_moved"
+    moved_run: str
+    seq: int  # the last event of its chain
+    sha256: str
+    target: str  # the data folder it was moved to
+    database: str  # the database of that folder, without its password
+
+
+class RunReceived(Record):
+    """A run came from another record, where nothing is appended to its chain any more; it goes on here."""
+
+    kind: Literal["run_received"] = "run_received"
+    moved_run: str
+    seq: int  # the last event of its chain, the same in both
+    sha256: str
+    source: str  # the data folder it came from
+    database: str  # the database of that folder, without its password
+    events: int  # events that were new here
+    files: int  # files that they and earlier events refer to
+    signatures: ArtefactRef  # a JSON file of its signatures and time stamps there, and of what they rest on
 
 
 class RecordRebuilt(Record):

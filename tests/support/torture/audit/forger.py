@@ -25,8 +25,7 @@ from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import RowsDigest, key_fingerprint, public_bytes
 from service.store.signatures.checkpoints import statement as signed_text
 from service.store.signatures.log import NAME, LogEnd, SignatureLog
-from tests.support.record.store import know_index
-from tests.support.record.tampering import INDEX_AGAIN
+from tests.support.record.outsider import INDEX_AGAIN, know_index
 from tests.support.torture.audit import outcome
 from tests.support.torture.audit.outcome import Verdict, verdict
 from tests.support.torture.audit.record import Record, put_back
