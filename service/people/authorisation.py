@@ -53,7 +53,7 @@ def who_acts(people: People, typed: str, password: Callable[[], str], permission
         people: accounts of the data folder.
         typed: the name as typed.
         password: asks for the password; not called on a site without accounts.
-        permission: what the person does. Their role must permit it, as it must on the pages.
+        permission: the permission that the act needs of the role, as on the pages.
 
     Raises:
         NotAllowedError: there are accounts, and none has this name, or its role does not permit this; or there are
