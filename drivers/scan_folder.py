@@ -75,19 +75,19 @@ class ScanFolder:
         """Do nothing: nothing is kept open."""
 
     def report(self) -> DeviceReport:
-        """Return the free space, the number of exports, and the incomplete ones as problems."""
+        """Return the free space, the number of exports, and as problems those that cannot be used."""
         require_folder(self._config.folder)
-        exports, pending = self._watch.poll()
-        pending += self._foreign()
+        found = self._watch.poll()
         return DeviceReport(
             identity=self._identity(),
             free_bytes=free_bytes(self._config.folder),
             details={
-                "exports": str(len(exports)),
+                "exports": str(len(found.complete)),
+                "arriving": str(found.arriving),
                 **self._expected(),
                 "stable_s": f"{self._config.stable_s:g}",
             },
-            problems=pending,
+            problems=found.problems + self._foreign(),
         )
 
     def answers(self) -> DeviceAnswers:
@@ -99,7 +99,7 @@ class ScanFolder:
     def exports(self) -> tuple[ScanExport, ...]:
         """Return the complete exports that this driver has seen unchanged for `stable_s`, oldest first."""
         require_folder(self._config.folder)
-        return tuple(one for one in self._watch.poll()[0] if self._config.only in ("", one.name))
+        return tuple(one for one in self._watch.poll().complete if self._config.only in ("", one.name))
 
     def read(self, export: ScanExport) -> ScannedMesh:
         """Read one export, in metres.

@@ -147,7 +147,7 @@ def what_runs(site: Site, web: Screens, worker_pid: int) -> dict[str, str]:
 
 def what_was_done(site: Site) -> dict[str, str]:
     """Return what each part of the site has done for the run."""
-    from service.store.objects.upload import upload_state  # noqa: PLC0415 - packages
+    from service.store.objects.spool import spool_level  # noqa: PLC0415 - packages
     from service.store.store import Store  # noqa: PLC0415
 
     with Store.open(site.data, create=False) as store:
@@ -155,7 +155,7 @@ def what_was_done(site: Site) -> dict[str, str]:
         events = store.events(run_id)
         sizes = {artefact.ref.sha256: artefact.ref.size_bytes for artefact in store.artefacts(run_id)}
         until_s = time.monotonic() + 60
-        while (state := upload_state(store)) is not None and state.waiting.files and time.monotonic() < until_s:
+        while (state := spool_level(store)) is not None and state.waiting.files and time.monotonic() < until_s:
             time.sleep(0.5)
     jobs = [event.payload for event in events if isinstance(event.payload, JobFinished)]
     tasks = sum(host.tasks for job in jobs if job.computed_on is not None for host in job.computed_on.cluster)

@@ -92,6 +92,7 @@ class DicomFolder:
         ]
         problems += [text for text in self._headers.values() if isinstance(text, str)]
         problems += self._without_the_wanted(series)
+        meshes, volumes = self._watch.poll(), self._niftis.poll()
         usable = [str(one.slices) for one in series if not one.problems and self._is_wanted(one)]
         return DeviceReport(
             identity=self._identity(),
@@ -99,11 +100,11 @@ class DicomFolder:
             details={
                 "series": str(len(series)),
                 "usable": f"{len(usable)}, of {', '.join(usable)} slices" if usable else "0",
-                "arriving": str(len(arriving)),
+                "arriving": str(len(arriving) + meshes.arriving + volumes.arriving),
                 **self._asked_for(series),
                 "stable_s": f"{self._config.stable_s:g}",
             },
-            problems=tuple(problems) + self._watch.poll()[1] + self._niftis.poll()[1],
+            problems=(*problems, *meshes.problems, *volumes.problems),
         )
 
     def answers(self) -> DeviceAnswers:
@@ -158,7 +159,7 @@ class DicomFolder:
     def segmentations(self) -> tuple[ScanExport, ...]:
         """Return the complete segmentations in the folder (DICOM SEG, NIfTI), oldest first."""
         groups = self._groups()
-        found = list(self._niftis.poll()[0])
+        found = list(self._niftis.poll().complete)
         for uid, headers in groups.items():
             if headers[0].modality == SEGMENTATION and not self._arriving(uid):
                 found += [_segmentation(path) for path in dict.fromkeys(header.path for header in headers)]
@@ -189,7 +190,7 @@ class DicomFolder:
     def segmented_meshes(self) -> tuple[ScanExport, ...]:
         """Return the complete segmented meshes in the folder (STL, PLY, OBJ), oldest first."""
         require_folder(self._config.folder)
-        return self._watch.poll()[0]
+        return self._watch.poll().complete
 
     def read_mesh(self, export: ScanExport) -> ScannedMesh:
         """Read one segmented mesh, in metres; raises as drivers.meshes.mesh_file.read_mesh_file does."""

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.folder_files import files_below
@@ -22,6 +23,20 @@ class _Seen:
     since_s: float
     export: ScanExport | None = None
     trouble: str = ""
+
+
+class WatchedExports(NamedTuple):
+    """What a look into the folder has found.
+
+    Attributes:
+        complete: the complete exports, oldest first.
+        arriving: the number of those that are whole, but have not been unchanged for long enough: no fault.
+        problems: one sentence for each file that is incomplete or cannot be used.
+    """
+
+    complete: tuple[ScanExport, ...]
+    arriving: int
+    problems: tuple[str, ...]
 
 
 class ExportWatch:
@@ -49,8 +64,8 @@ class ExportWatch:
         self._check = check
         self._seen: dict[Path, _Seen] = {}
 
-    def poll(self) -> tuple[tuple[ScanExport, ...], tuple[str, ...]]:
-        """Return the complete exports, oldest first, and one sentence for each incomplete one.
+    def poll(self) -> WatchedExports:
+        """Return what is in the folder now.
 
         Raises DeviceUnavailableError if the folder cannot be read.
         """
@@ -58,23 +73,23 @@ class ExportWatch:
         present = mesh_files(self._folder, self._suffixes)
         self._seen = {path: seen for path, seen in self._seen.items() if path in present}
         exports: list[tuple[int, ScanExport]] = []
-        pending: list[str] = []
+        arriving = 0
+        problems: list[str] = []
         for path in present:
             try:
                 seen = self._observe(path, now)
             except OSError as error:
                 self._seen.pop(path, None)
-                pending.append(f"{name_of(path)}: cannot be read ({error.strerror})")
+                problems.append(f"{name_of(path)}: cannot be read ({error.strerror})")
                 continue
-            waited_s = now - seen.since_s
-            if seen.export is not None and waited_s >= self._stable_s:
+            if seen.export is None:
+                problems.append(f"{name_of(path)}: {seen.trouble}")
+            elif now - seen.since_s >= self._stable_s:
                 exports.append((seen.signature[0][2], seen.export))
-            elif seen.export is not None:
-                pending.append(f"{name_of(path)}: unchanged for {waited_s:.1f} s, waiting for {self._stable_s:g} s")
             else:
-                pending.append(f"{name_of(path)}: {seen.trouble}")
+                arriving += 1
         exports.sort(key=lambda item: (item[0], item[1].name))
-        return tuple(export for _, export in exports), tuple(pending)
+        return WatchedExports(tuple(export for _, export in exports), arriving, tuple(problems))
 
     def _observe(self, path: Path, now: float) -> _Seen:
         old = self._seen.get(path)

@@ -265,7 +265,7 @@ def sign_here_command(
     First end the processes of that folder and move its keys/ and signatures.jsonl here.
     """
     with reporting_errors(json), Store.open(data, create=False) as store:
-        who = acting_person(store, operator, password_stdin=password_stdin)
+        who = acting_person(store, operator, "administer", password_stdin=password_stdin)
         made = sign_here(store, actor=who.name)
     if json:
         print_json(asdict(made))

@@ -16,6 +16,7 @@ NEEDED: dict[str, Permission] = {
     "act sign": "sign",
     "accounts end-wait": "administer",
     "audit rotate-key": "administer",
+    "audit sign-here": "administer",
     "audit export": "report",
     "audit report": "report",
     "audit release": "release",

@@ -27,7 +27,7 @@ from service.core.records.events import (
 )
 from service.dataset.export_folder import check_folder
 from service.store.database.postgres_schema import EVIDENCE
-from service.store.objects.upload import upload_state
+from service.store.objects.spool import spool_level
 from service.store.store import Store
 from tests.support.processes.cluster import end_tree
 from tests.support.processes.postgres import ROLE
@@ -151,7 +151,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Generator[Ended]:
 def waiting(site: Site) -> int:
     """The number of recorded files that the object store has not confirmed."""
     with Store.open(site.data, create=False) as store:
-        state = upload_state(store)
+        state = spool_level(store)
     assert state is not None
     return state.waiting.files
 

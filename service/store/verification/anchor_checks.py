@@ -74,7 +74,7 @@ class AnchorFindings:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class RecordSide:
     """The side of the record in the comparison: the log of signatures, its keys and the chains.
 
     Attributes:
@@ -90,7 +90,7 @@ class Record:
     every_run: bool
 
 
-def compare(anchors: ReadAnchors, record: Record) -> AnchorFindings:
+def compare(anchors: ReadAnchors, record: RecordSide) -> AnchorFindings:
     """Return what the anchors show of a record."""
     found = AnchorFindings()
     by_name: dict[str, list[LockedVersion]] = {}
@@ -170,7 +170,7 @@ def _text(at: datetime) -> str:
 
 
 def _compare_lines(
-    found: AnchorFindings, anchors: ReadAnchors, record: Record, held: Mapping[int, Sequence[LockedVersion]]
+    found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, held: Mapping[int, Sequence[LockedVersion]]
 ) -> None:
     """Compare every line of the log with its anchor, and look for anchors of lines that are gone."""
     beyond: list[int] = []
@@ -197,7 +197,7 @@ def _compare_lines(
     _check_missing(found, anchors, record, held)
 
 
-def _ours(line: str, number: int, record: Record) -> bool:
+def _ours(line: str, number: int, record: RecordSide) -> bool:
     """Return whether a key of this record signed a line, whatever line is before it here."""
     parsed = line_alone(line.encode(errors="replace"))
     key = record.keys.get(parsed.key_id)
@@ -205,7 +205,7 @@ def _ours(line: str, number: int, record: Record) -> bool:
 
 
 def _check_missing(
-    found: AnchorFindings, anchors: ReadAnchors, record: Record, held: Mapping[int, Sequence[LockedVersion]]
+    found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, held: Mapping[int, Sequence[LockedVersion]]
 ) -> None:
     """List the lines without an anchor: too new for one, too old for the lock, or neither, which is a fault."""
     waiting: list[datetime] = []
@@ -266,7 +266,7 @@ def _time(at_utc: str) -> datetime | None:
 
 
 def _compare_roots(
-    found: AnchorFindings, anchors: ReadAnchors, record: Record, held: Mapping[date, Sequence[LockedVersion]]
+    found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, held: Mapping[date, Sequence[LockedVersion]]
 ) -> int:
     """Compare the daily ends of chains with the record. Returns how many were compared."""
     compared = 0
@@ -314,7 +314,7 @@ def _signed(anchor: RootAnchor, keys: Mapping[str, bytes]) -> bool:
     return True
 
 
-def _note_days(found: AnchorFindings, anchors: ReadAnchors, record: Record, days: Sequence[date]) -> None:
+def _note_days(found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, days: Sequence[date]) -> None:
     """Add a note on the days without a root since the first one, and on the longest gap."""
     if not days:
         if record.lines:

@@ -34,7 +34,7 @@ from service.store.verification.anchor_checks import (
     AnchorCounts,
     AnchorFindings,
     ReadAnchors,
-    Record,
+    RecordSide,
     compare,
     not_compared,
 )
@@ -293,7 +293,7 @@ def _anchor_findings(
         said = not_compared(anchors.place, anchors.why, counts.lines_not_compared, counts.heads_not_compared)
         return AnchorFindings(counts=counts), (said,)
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
-    return compare(anchors, Record(lines, chains, public_keys, every_run)), ()
+    return compare(anchors, RecordSide(lines, chains, public_keys, every_run)), ()
 
 
 def _check_chains(
