@@ -26,7 +26,7 @@ class _Seen:
 
 
 class WatchedExports(NamedTuple):
-    """What a look into the folder has found.
+    """The findings of a look into the folder.
 
     Attributes:
         complete: the complete exports, oldest first.
