@@ -28,7 +28,7 @@ from service.store.signatures.log import NAME as LOG
 from service.store.signatures.log import read_log
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
-from service.store.verification.anchor_checks import ReadAnchors, Record, compare
+from service.store.verification.anchor_checks import ReadAnchors, RecordSide, compare
 from service.store.verification.verify import AuditReport, verify
 from tests.support.processes.object_store import Weed
 from tests.support.record.store import start_run
@@ -323,7 +323,7 @@ def test_a_line_that_is_older_than_the_lock_needs_no_anchor(site: Site) -> None:
     assert isinstance(anchors, ReadAnchors)
     assert lines is not None
     later = replace(anchors, at=anchors.at + timedelta(days=LOCKED_DAYS, hours=1), patience=timedelta())
-    record = Record(lines, {}, {}, every_run=False)
+    record = RecordSide(lines, {}, {}, every_run=False)
     assert any("no anchor any more, up to line" in note for note in compare(later, record).notes)
 
     def unanchored(at: datetime) -> bool:
