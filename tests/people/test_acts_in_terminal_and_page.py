@@ -67,7 +67,15 @@ OF_THE_MACHINE = {
     *("demo", "serve", "worker", "doctor", "simulate", "dicom-listen", "import", "store", "protocol", "plan"),
     *("calibrate", "import-ros", "develop", "sfm", "register", "spheres", "layout", "fuse", "evaluate", "benchmark"),
     *("status", "runs", "compare", "history", "replay"),  # reading, which pages do in their own ways
-    *("audit show", "audit keys", "audit checkpoint", "audit rotate-key", "audit report", "audit figures"),
+    *(
+        "audit show",
+        "audit keys",
+        "audit checkpoint",
+        "audit rotate-key",
+        "audit sign-here",
+        "audit report",
+        "audit figures",
+    ),
 }
 
 

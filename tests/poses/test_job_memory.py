@@ -162,13 +162,14 @@ def test_a_job_that_waits_for_other_programs_holds_up_no_other(store: Store, clo
 
 
 def test_a_job_for_which_other_programs_leave_no_room_asks_in_the_end(store: Store, clock: SteppedClock) -> None:
+    # Terabytes: what the process of these tests has, which counts as used, must not matter.
     data = store.database_path.parent
-    grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, 1000), patience_s=20)
+    grants = MemoryGrants(data, clock, lambda: MachineMemory(8e6, 1e6), patience_s=20)
     told: list[str] = []
     began_s = clock.monotonic_s()
     with (
         pytest.raises(ComputeError, match="has waited 20 s for memory that no computation uses: it waits for"),
-        grants.granted("mine", 3000, told.append),
+        grants.granted("mine", 3e6, told.append),
     ):
         pytest.fail("it has begun")
     assert 20 < clock.monotonic_s() - began_s < 22
@@ -178,16 +179,16 @@ def test_a_job_for_which_other_programs_leave_no_room_asks_in_the_end(store: Sto
 
 def test_a_job_waits_for_those_of_other_workers_however_long_they_take(store: Store, clock: SteppedClock) -> None:
     data = store.database_path.parent
-    theirs = write_grant(data / "monitor" / "memory", os.getppid(), "theirs", 5000)
+    theirs = write_grant(data / "monitor" / "memory", os.getppid(), "theirs", 5e6)
     began_s = clock.monotonic_s()
 
     def memory() -> MachineMemory:
         if clock.monotonic_s() - began_s < 25:
-            return MachineMemory(8000, 2000)
+            return MachineMemory(8e6, 2e6)
         theirs.unlink(missing_ok=True)
-        return MachineMemory(8000, 7000)
+        return MachineMemory(8e6, 7e6)
 
-    with MemoryGrants(data, clock, memory, patience_s=20).granted("mine", 3000, lambda _why: None):
+    with MemoryGrants(data, clock, memory, patience_s=20).granted("mine", 3e6, lambda _why: None):
         assert clock.monotonic_s() - began_s >= 25
 
 
