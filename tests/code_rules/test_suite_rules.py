@@ -68,6 +68,8 @@ def test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printe
 import pytest
 @pytest.mark.whole(always=True)
 def test_always(): pass
+@pytest.mark.whole(drawn=False)
+def test_too_long(): pass
 @pytest.mark.sweep
 @pytest.mark.parametrize("row", range(20))
 def test_row(row): pass
@@ -78,7 +80,7 @@ def test_other(): pass
 """
     answer = pytest_in(tmp_path, source, "--draw", "seed")
     assert "drawn by seed: 3 of 28 marked sweep" in answer.stdout
-    assert "6 passed, 25 deselected" in answer.stdout
+    assert "6 passed, 26 deselected" in answer.stdout
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
 `pytest --draw SEED` keeps every test but those marked `whole` or `sweep`, of which it keeps a tenth, chosen by the
 seed (continuous integration gives the commit's hash), and prints which. Of every matrix, however small, at least one
-row runs. Tests and rows marked `whole(always=True)` or `sweep(always=True)` are kept whatever the seed. Without
-`--draw` all of them run.
+row runs. Tests and rows marked `whole(always=True)` or `sweep(always=True)` are kept whatever the seed, and those
+marked `whole(drawn=False)` never. Without `--draw` all of them run.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class Draw:
         covered: set[str] = set()
         for item in items:
             mark = next(filter(None, map(item.get_closest_marker, units)), None)
-            if mark is None or mark.kwargs.get("always", False):
+            if mark is not None and not mark.kwargs.get("drawn", True):
+                left_out.add(item)
+            elif mark is None or mark.kwargs.get("always", False):
                 covered.add(item.nodeid.partition("[")[0])
             else:
                 unit = item.nodeid.partition("::")[0] if mark.name == "whole" else item.nodeid

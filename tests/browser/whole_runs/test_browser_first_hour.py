@@ -27,7 +27,8 @@ from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, RIG_LOCK
 
-pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(5400)]
+# A rig as people start it keeps the pace of a real one: a quarter of an hour, which a drawn test must not take.
+pytestmark = [pytest.mark.slow, pytest.mark.whole(drawn=False), pytest.mark.timeout(5400)]
 
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _ROW = re.compile(r"^\| .* \| `(orthocapture [^`]+)` \|$", re.MULTILINE)
