@@ -75,7 +75,9 @@ def who_acts(people: People, typed: str, password: Callable[[], str], permission
     permitted = [each for each in ROLES if may(each, permission)]
     if role not in permitted:
         raise NotAllowedError(
-            f"{name} is {role} and may not do this", where=permission, remedy=f"Call a {' or '.join(permitted)}"
+            f"{name} is {role} and may not do this",
+            where=permission,
+            remedy=f"Call somebody whose role is {' or '.join(permitted)}",
         )
     return Identity(name, role, "password")
 

@@ -32,6 +32,7 @@ from service.core.arms.model import arm_model
 from service.core.arms.model import flange_pose as forward
 from tests.support.arms.kuka_simulator import pendant, simulated_kuka, transcript
 from tests.support.arms.ur_simulator import address
+from tests.support.processes.below import processes_below
 from tests.support.processes.hosts import driver_pid
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
@@ -276,7 +277,6 @@ def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
 def test_its_process_ends_with_the_driver() -> None:
     host = address(95)
     with simulated_kuka(host), opened(host) as arm:
-        children = psutil.Process().children(recursive=True)
-        (listener,) = [child for child in children if "drivers.kuka.fri" in " ".join(child.cmdline())]
+        (listener,) = processes_below(lambda line: "drivers.kuka.fri" in " ".join(line))
         os.kill(driver_pid(arm), signal.SIGKILL)
         assert not psutil.wait_procs([listener], timeout=90)[1]

@@ -11,12 +11,13 @@ from service.cli.run import worker_beside
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
+from tests.support.processes.below import processes_below
 from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue, start_run
 
 
 def worker_of(data: Path) -> psutil.Process:
-    (found,) = (child for child in psutil.Process().children() if str(data) in child.cmdline())
+    (found,) = processes_below(lambda line: str(data) in line, recursive=False)
     return found
 
 

@@ -183,7 +183,7 @@ def test_an_administrator_clears_it_on_the_command_line(tmp_path: Path) -> None:
             assert site.browser().sign_in("emmy", "guessed").status_code == 401
             emmy.send_form("/account/pin", password="guessed", pin="1111")
         words = ["accounts", "end-wait", "emmy", *data, "--operator"]
-        for name, said in (("emmy", "no administrator"), ("eve", "only accounts act")):
+        for name, said in (("emmy", "emmy is supervisor and may not do this"), ("eve", "only accounts act")):
             refused = CliRunner().invoke(app, [*words, name], input=f"{password_of(name)}\n", catch_exceptions=False)
             assert (refused.exit_code, said in refused.stderr) == (1, True), refused.stderr
         done = CliRunner().invoke(app, [*words, "ada"], input=f"{password_of('ada')}\n", catch_exceptions=False)

@@ -17,6 +17,7 @@ from service.cli.exit_status import ExitStatus
 from service.cli.run import end_with_children
 from service.core.records.events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
 from tests.recovery.test_resume import captured, recorded, short_protocol, wait_for, wait_for_captures
+from tests.support.processes.below import processes_below
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig
 
@@ -58,8 +59,7 @@ def pressed(words: list[str], log: Path) -> Generator[subprocess.Popen[bytes]]:
 
 
 def drivers_of(runner: subprocess.Popen[bytes]) -> list[psutil.Process]:
-    children = psutil.Process(runner.pid).children()
-    return [child for child in children if "drivers.host" in " ".join(child.cmdline())]
+    return processes_below(lambda line: "drivers.host" in " ".join(line), psutil.Process(runner.pid), recursive=False)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from service.core.records.events import ViewpointCaptured
 from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
+from tests.support.processes.below import processes_below
 from tests.support.processes.forked import Forked
 from tests.support.processes.waiting import until
 from tests.support.rig.gphoto_rig import PAPER, driver
@@ -176,9 +177,8 @@ def test_what_is_computed_ahead_is_written_when_asked_for_and_shows_the_scene_as
     ):
 
         def ahead(simulator: str) -> list[int]:
-            processes = psutil.Process().children(recursive=True)
-            lines = {process.pid: process.cmdline() for process in processes if process.is_running()}
-            return [pid for pid, line in lines.items() if line[3:4] == [simulator] and "--when-told" in line]
+            found = processes_below(lambda line: line[3:4] == [simulator] and "--when-told" in line)
+            return [process.pid for process in found]
 
         until(lambda: len(ahead("ct")) == 1, "the CT is not computed ahead")
         assert list(Path(ready["ct_folder"]).iterdir()) == []
@@ -281,7 +281,7 @@ def test_devices_and_a_ct_scan_end_with_a_rig_that_was_killed(tmp_path: Path) ->
     with rig_process(tmp_path) as (process, ready, _), ThreadPoolExecutor(1) as pool, Hands(ready["world"]) as hands:
         pool.submit(hands.send, '{"op": "act", "action": "ct_scan"}')
         root = psutil.Process(process.pid)
-        until(lambda: any("ct" in child.cmdline() for child in root.children()), "the CT does not scan")
+        until(lambda: processes_below(lambda line: "ct" in line, root, recursive=False) != [], "the CT does not scan")
         children = root.children()
         assert len(children) == 4  # arm, camera, light box and scan
         process.kill()  # before the scan's own process has begun to look whose child it is
@@ -363,11 +363,7 @@ def test_a_device_that_dies_is_switched_on_again_at_its_address(tmp_path: Path) 
     with simulated_rig(tmp_path, *options, host=OWN_HOST, start=subprocess.Popen) as ready:
         before = load_rig(Path(ready["rig"])).source
         port = int(load_rig(Path(ready["rig"])).section.devices["camera"]["port"].rpartition(":")[2])
-        camera = next(
-            process
-            for process in psutil.Process().children(recursive=True)
-            if process.cmdline()[2:4] == ["simulators", "camera"]
-        )
+        camera = processes_below(lambda line: line[2:4] == ["simulators", "camera"])[0]
         camera.kill()
 
         def answers() -> bool:
