@@ -255,7 +255,7 @@ def run_command(
             if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
-            with _waiting_run_named(run_id):
+            with _waiting_run_named(run_id, data):
                 state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
 
@@ -280,7 +280,7 @@ def resume_command(
         who = None
         if not (auto_confirm or screens):
             who = acting_person(store, operator or root.operator, "operate", password_stdin=password_stdin)
-        with _waiting_run_named(run_id):
+        with _waiting_run_named(run_id, data):
             state = drive(
                 store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens, who=who
             )
@@ -288,10 +288,13 @@ def resume_command(
 
 
 @contextmanager
-def _waiting_run_named(run_id: str) -> Generator[None]:
-    """Let the error of a run that waits for a person name the run."""
+def _waiting_run_named(run_id: str, data: Path) -> Generator[None]:
+    """Let the error of a run that waits for a person name the run; tell whoever pressed Ctrl-C how to continue it."""
     try:
         yield
+    except KeyboardInterrupt:
+        error_console.print(f"Run {run_id} stays open. Continue it with: orthocapture resume {run_id} --data {data}")
+        raise
     except PersonNeededError as error:
         where = f"run {run_id}, {error.where}".removesuffix(", ")
         raise PersonNeededError(error.what, where=where, remedy=error.remedy) from error

@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import select
+import signal
 from collections.abc import Generator
 from pathlib import Path
 
@@ -84,6 +85,7 @@ def terminal(tmp_path: Path) -> Generator[Terminal]:
         opened.close()
 
 
+@pytest.mark.slow
 def test_a_run_by_hand(terminal: Terminal) -> None:
     terminal.wait_for("Specimen, name or number")
     terminal.type("Spine 9")
@@ -127,3 +129,14 @@ def test_another_terminal_answers_and_aborts(terminal: Terminal) -> None:
     )
     terminal.wait_for("is aborted")
     assert terminal.process.wait(timeout=30) == 1
+
+
+def test_ctrl_c_leaves_the_run_and_says_how_it_goes_on(terminal: Terminal) -> None:
+    terminal.wait_for("Specimen, name or number")
+    terminal.type("Spine 9")
+    terminal.wait_for("Two wires hold each piece")
+    terminal.process.send_signal(signal.SIGINT)
+    terminal.wait_for("Continue it with: orthocapture resume")
+    assert terminal.process.wait(timeout=30) != 0
+    status = json.loads(orthocapture("status", "latest", "--data", str(terminal.data), "--json").stdout)
+    assert status["status"] not in ("completed", "aborted")
