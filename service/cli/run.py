@@ -289,7 +289,7 @@ def resume_command(
 
 @contextmanager
 def _waiting_run_named(run_id: str, data: Path) -> Generator[None]:
-    """Let the error of a run that waits for a person name the run; tell whoever pressed Ctrl-C how to continue it."""
+    """Let the error of a run that waits for a person name the run; say after Ctrl-C how to continue it."""
     try:
         yield
     except KeyboardInterrupt:
