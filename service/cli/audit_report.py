@@ -25,7 +25,7 @@ from service.cli.common import (
     require_writable_folder,
 )
 from service.cli.exit_status import ExitStatus
-from service.cli.options import OperatorOption, PasswordOption, acting_person
+from service.cli.options import OperatorOption, PasswordOption, acting_name
 from service.core.errors import ConfigurationError
 from service.core.text.words import counted
 from service.store.database.engine import database_path
@@ -63,7 +63,7 @@ def report_command(
             if path is not None:
                 require_writable(path)
         run_id = resolve_run(audit.list_runs(data), run)
-        actor = _actor(data, operator, password_stdin=password_stdin) if _writable(data) else ""
+        actor = acting_name(data, operator, "report", password_stdin=password_stdin) if _writable(data) else ""
         with progress_bar(quiet=json) as progress:
             verified = audit.verify(data, run_id, progress).with_limits()
             # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
@@ -98,15 +98,6 @@ def report_command(
         if not json:
             error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
         raise typer.Exit(ExitStatus.FAILED)
-
-
-def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
-    """Return the name of the person for whom the report is recorded.
-
-    Raises ConfigurationError, SignInRefusedError.
-    """
-    with Store.open(data, create=False) as store:
-        return acting_person(store, operator, "report", password_stdin=password_stdin).name
 
 
 def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str], None] | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import sys
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -45,6 +46,12 @@ def typed_password(name: str, *, from_stdin: bool) -> str:
         return getpass.getpass(f"Password of {shown(name)}: ")
     except EOFError as error:
         raise ConfigurationError("no password was given", remedy="Type it, or give --password-stdin") from error
+
+
+def acting_name(data: Path, operator: str, permission: Permission, *, password_stdin: bool) -> str:
+    """Return the name of the person who acts on a data folder. Raises StoreError, and as `acting_person`."""
+    with Store.open(data, create=False) as store:
+        return acting_person(store, operator, permission, password_stdin=password_stdin).name
 
 
 SpecimenOption = Annotated[

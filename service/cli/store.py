@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ from service.cli.common import (
 )
 from service.cli.exit_status import ExitStatus
 from service.cli.object_store import gc_spool, upload_command
-from service.cli.options import OperatorOption, PasswordOption, acting_person
+from service.cli.options import OperatorOption, PasswordOption, acting_name, acting_person
 from service.core.text.words import counted
 from service.core.units import gigabytes
 from service.store.backup.backup import BackupOptions, BackupReport, back_up
@@ -79,10 +80,7 @@ def restore_command(
     missing or does not verify.
     """
 
-    def actor(folder: Path) -> str:
-        with Store.open(folder, create=False) as store:
-            return acting_person(store, operator, "read", password_stdin=password_stdin).name
-
+    actor = partial(acting_name, operator=operator, permission="read", password_stdin=password_stdin)
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         require_writable_folder(destination)
         made = restore(backup, destination, name=state, actor=actor, progress=progress)
@@ -175,10 +173,7 @@ def rebuild_command(
     was done. The exit status is 1 if anything could not be restored.
     """
 
-    def actor(folder: Path) -> str:
-        with Store.open(folder, create=False) as store:
-            return acting_person(store, operator, "read", password_stdin=password_stdin).name
-
+    actor = partial(acting_name, operator=operator, permission="read", password_stdin=password_stdin)
     with reporting_errors(json):
         made = rebuild(data, actor=actor, journal=journal)
     if json:
@@ -258,10 +253,7 @@ def copy_command(
     refuses to go on with it. After an interruption, repeat the command and it will continue.
     """
 
-    def actor(folder: Path) -> str:
-        with Store.open(folder, create=False) as store:
-            return acting_person(store, operator, "read", password_stdin=password_stdin).name
-
+    actor = partial(acting_name, operator=operator, permission="read", password_stdin=password_stdin)
     if run:
         with reporting_errors(json), progress_bar(quiet=json) as progress:
             moved = move_run(source, target, run, actor=actor, progress=progress)

@@ -23,12 +23,14 @@ from tests.support.pages.browser import (
     Cable,
     Screen,
     Served,
+    accept_on_page,
     accessibility_faults,
-    fill_secrets,
     follow,
+    invite_on_page,
     invite_people,
     screen,
     served,
+    set_up_administrator,
 )
 from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
@@ -61,25 +63,10 @@ def people(server: Served, browser: Browser) -> None:
     The first of them is invited on the page.
     """
     with screen(browser, server.url) as first:
-        page = first.page
-        page.goto(server.set_up)
-        page.get_by_label("Your name").fill("Ada Example")
-        page.get_by_label("Account, to sign in with").fill("ada")
-        fill_secrets(page)
-        page.get_by_role("button", name="Set up the account").click()
-        if page.get_by_role("button", name="Sign out").count() == 0:
-            first.sign_in("ada")
-        first.go("/accounts")
-        page.get_by_label("Name, as records and signatures show it").fill("Tina Example")
-        page.get_by_label("Account, to sign in with").fill("tina")
-        page.get_by_role("combobox", name="Role").select_option("technician")
-        page.get_by_role("button", name="Make a one-time link").click()
-        link = page.locator(".once").inner_text()
+        set_up_administrator(first, server.set_up)
+        link = invite_on_page(first, "tina", "technician")
         with screen(browser, server.url) as own:
-            own.page.goto(link)
-            fill_secrets(own.page)
-            own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
-            expect(own.page.get_by_text("The account is ready")).to_be_visible()
+            accept_on_page(own, link)
             # The link works only once.
             assert own.page.goto(link).status in (404, 409, 410)  # type: ignore[union-attr]
     invite_people(server.data, (("tom", "technician"), ("sam", "supervisor"), ("otto", "auditor")))

@@ -69,7 +69,6 @@ TESTS = {
 }
 # Those that still do, and shall not: this list only gets shorter.
 STILL = {
-    "tests/browser/whole_runs/test_browser_demo.py",
     "tests/browser/whole_runs/test_browser_tasks.py",
     "tests/grbl/test_grbl_driver.py",
     "tests/grbl/test_grbl_late_lines.py",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 import yaml
 from playwright.sync_api import Browser, Page, expect
-from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
 from tests.support.pages.browser import DESKTOP, PASSWORD, Served, add_people, follow, screen, served
 from tests.support.pages.technician import ANSWER_MS, Technician
@@ -67,23 +65,9 @@ def run(server: Served, browser: Browser) -> str:
     """Complete a run; returns its id."""
     with screen(browser, server.url) as tablet:
         tablet.sign_in("tina")
-        tablet.go("/")
-        tablet.page.get_by_role("button", name="Start Demonstration on a simulated rig").click()
-        tablet.page.get_by_label("Specimen").fill("S1")
-        tablet.page.get_by_role("button", name="Start the run").click()
-        expect(tablet.page.get_by_role("checkbox").first).to_be_visible(timeout=ANSWER_MS)
-        name = tablet.page.url.rpartition("/")[2]
         technician = Technician(tablet)
-        began_s, step, missed = time.monotonic(), "", "nothing"
-        while tablet.page.get_by_role("heading", name="The run is complete").count() == 0:
-            waited_s = time.monotonic() - began_s
-            assert waited_s < STEP_S, f"{step}\n{server.log()}\n{tablet.words()}\nmissed last: {missed}"
-            try:
-                technician.do_what_is_asked()
-                now = tablet.page.get_by_role("heading", level=1).inner_text(timeout=5_000)
-                began_s, step = (began_s, step) if now == step else (time.monotonic(), now)
-            except PlaywrightTimeoutError as error:  # the page changed meanwhile: look again
-                missed = str(error)
+        name = technician.start("Demonstration on a simulated rig")
+        technician.complete_the_run(STEP_S, server.log)
         assert technician.held >= 5  # calibration and four captures
         assert technician.signed >= 3  # before irreversible changes of the scene
     return name

@@ -15,15 +15,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect
-from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
+from playwright.sync_api import Browser
 
-from tests.support.pages.browser import PASSWORD, Screen, fill_secrets, screen
-from tests.support.pages.technician import ANSWER_MS, Technician
+from service.people.person import Role
+from tests.support.pages.browser import PASSWORD, accept_on_page, invite_on_page, screen, set_up_administrator
+from tests.support.pages.technician import Technician
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, RIG_LOCK
 
@@ -33,7 +32,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.whole(drawn=False), pytest.mark.time
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _ROW = re.compile(r"^\| .* \| `(orthocapture [^`]+)` \|$", re.MULTILINE)
 _ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
-_PEOPLE = {"tina": "technician", "sam": "supervisor"}
+_PEOPLE: dict[str, Role] = {"tina": "technician", "sam": "supervisor"}
 STEP_S = 900  # after which a step, of minutes on a quiet machine, does not end any more
 
 
@@ -174,59 +173,17 @@ def _size_bytes(path: Path) -> int:
 def _complete_a_run(browser: Browser, url: str, set_up: str) -> str:
     """Make the accounts, and complete a run as its technician; returns the run's id."""
     with screen(browser, url) as tablet:
-        page = tablet.page
-        page.goto(set_up)
-        page.get_by_label("Your name").fill("Ada Example")
-        page.get_by_label("Account, to sign in with").fill("ada")
-        fill_secrets(page)
-        page.get_by_role("button", name="Set up the account").click()
-        tablet.sign_in("ada")
-        links = {account: _invite(tablet, account, role) for account, role in _PEOPLE.items()}
-    for link in links.values():
+        set_up_administrator(tablet, set_up)
+        links = [invite_on_page(tablet, account, role) for account, role in _PEOPLE.items()]
+    for link in links:
         with screen(browser, url) as own:
-            own.page.goto(link)
-            fill_secrets(own.page)
-            own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
-            expect(own.page.get_by_text("The account is ready")).to_be_visible()
+            accept_on_page(own, link)
     with screen(browser, url) as tablet:
-        page = tablet.page
         tablet.sign_in("tina")
-        tablet.go("/")
-        page.get_by_role("button", name="Start Demonstration on a simulated rig").click()
-        page.get_by_label("Specimen").fill("S1")
-        page.get_by_role("button", name="Start the run").click()
-        expect(page.get_by_role("checkbox").first).to_be_visible(timeout=ANSWER_MS)
-        run = page.url.rpartition("/")[2]
-        _do_what_is_asked(tablet)
+        technician = Technician(tablet)
+        run = technician.start("Demonstration on a simulated rig")
+        technician.complete_the_run(STEP_S)
         return run
-
-
-def _invite(tablet: Screen, account: str, role: str) -> str:
-    """Invite a person on the page Accounts, and return the one-time link."""
-    tablet.go("/accounts")
-    page = tablet.page
-    page.get_by_label("Name, as records and signatures show it").fill(f"{account.title()} Example")
-    page.get_by_label("Account, to sign in with").fill(account)
-    page.get_by_role("combobox", name="Role").select_option(role)
-    page.get_by_role("button", name="Make a one-time link").click()
-    return page.locator(".once").inner_text()
-
-
-def _do_what_is_asked(tablet: Screen) -> None:
-    technician = Technician(tablet)
-    complete = tablet.page.get_by_role("heading", name="The run is complete")
-    title = tablet.page.get_by_role("heading", level=1)
-
-    def went_on(step: str) -> bool:
-        try:
-            technician.do_what_is_asked()
-            return complete.count() > 0 or title.inner_text(timeout=5_000) != step
-        except PlaywrightTimeoutError:  # the page changed meanwhile: look again
-            return False
-
-    while complete.count() == 0:
-        step = title.inner_text(timeout=ANSWER_MS)
-        until(partial(went_on, step), tablet.words, STEP_S)
 
 
 def _type_the_table(work: Shell, run: str) -> None:

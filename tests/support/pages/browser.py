@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import signal
 import socket
@@ -245,6 +246,37 @@ class Screen:
         self.page.mouse.down()
         self.page.wait_for_timeout(1000 * seconds)
         self.page.mouse.up()
+
+
+def set_up_administrator(first: Screen, link: str) -> None:
+    """Set up Ada, the administrator, by the link that `serve` prints, and sign in."""
+    page = first.page
+    page.goto(link)
+    page.get_by_label("Your name").fill("Ada Example")
+    page.get_by_label("Account, to sign in with").fill("ada")
+    fill_secrets(page)
+    page.get_by_role("button", name="Set up the account").click()
+    if page.get_by_role("button", name="Sign out").count() == 0:
+        first.sign_in("ada")
+
+
+def invite_on_page(administrator: Screen, account: str, role: Role) -> str:
+    """Invite a person on the page Accounts; returns the one-time link."""
+    administrator.go("/accounts")
+    page = administrator.page
+    page.get_by_label("Name, as records and signatures show it").fill(f"{account.title()} Example")
+    page.get_by_label("Account, to sign in with").fill(account)
+    page.get_by_role("combobox", name="Role").select_option(role)
+    page.get_by_role("button", name="Make a one-time link").click()
+    return page.locator(".once").inner_text()
+
+
+def accept_on_page(own: Screen, link: str) -> None:
+    """Set up the account of a one-time link."""
+    own.page.goto(link)
+    fill_secrets(own.page)
+    own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
+    expect(own.page.get_by_text("The account is ready")).to_be_visible()
 
 
 @contextmanager

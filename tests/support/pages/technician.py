@@ -6,9 +6,11 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from playwright.sync_api import Locator, expect
+from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
 from tests.support.pages.browser import PASSWORD, Screen
 from tests.support.processes.waiting import until
@@ -27,6 +29,34 @@ class Technician:
         self.tablet, self.page = tablet, tablet.page
         self.held = self.signed = self.in_vain = 0
         self.mends: Counter[str] = Counter()  # title of a step → number of times its advice was followed
+
+    def start(self, title: str) -> str:
+        """Start a run of the protocol of this title; returns its id once it asks for something."""
+        self.tablet.go("/")
+        self.page.get_by_role("button", name=f"Start {title}").click()
+        self.page.get_by_label("Specimen").fill("S1")
+        self.page.get_by_role("button", name="Start the run").click()
+        expect(self.page.get_by_role("checkbox").first).to_be_visible(timeout=ANSWER_MS)
+        return self.page.url.rpartition("/")[2]
+
+    def complete_the_run(self, step_s: float, log: Callable[[], str] = lambda: "") -> None:
+        """Act until the run is complete; fail, with the page's text and the log, where a step hangs."""
+        complete = self.page.get_by_role("heading", name="The run is complete")
+        title = self.page.get_by_role("heading", level=1)
+        missed = "nothing"
+
+        def went_on(step: str) -> bool:
+            nonlocal missed
+            try:
+                self.do_what_is_asked()
+                return complete.count() > 0 or title.inner_text(timeout=5_000) != step
+            except PlaywrightTimeoutError as error:  # the page changed meanwhile: look again
+                missed = str(error)
+                return False
+
+        while complete.count() == 0:
+            step = title.inner_text(timeout=ANSWER_MS)
+            until(partial(went_on, step), lambda: f"{log()}\n{self.tablet.words()}\nmissed last: {missed}", step_s)
 
     def do_what_is_asked(self) -> None:
         """Tick, sign, confirm or hold, or follow advice; wait while the software works."""
