@@ -36,25 +36,36 @@ def edits(data: Path) -> Iterator[Edit]:
     with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
         connection.row_factory = sqlite3.Row
         for table in TABLES:
-            rows = connection.execute(f'SELECT rowid AS row_number, * FROM "{table}" ORDER BY rowid').fetchall()
             columns = connection.execute(f'PRAGMA table_info("{table}")').fetchall()
-            yield from _of_rows(table, rows, columns)
+            own = _own_columns(connection, table, columns)
+            known = ", ".join(f"{name} AS {name}" for name in own)
+            number = "rowid" if own == ["rowid"] else f"row_number() OVER (ORDER BY {', '.join(own)})"
+            listed = f'SELECT {number} AS row_number, {known}, * FROM "{table}" ORDER BY row_number'
+            yield from _of_rows(table, connection.execute(listed).fetchall(), columns, own)
         yield from _of_another_run(connection)
         yield from _of_words(connection)
         yield from _of_schema(connection)
 
 
-def _of_rows(table: str, rows: list[Any], columns: list[Any]) -> Iterator[Edit]:
+def _own_columns(connection: sqlite3.Connection, table: str, columns: list[Any]) -> list[str]:
+    """Columns by whose values a row is found: SQLite's row number, or the key of a table that has none."""
+    (without_number,) = connection.execute("SELECT wr FROM pragma_table_list WHERE name = ?", (table,)).fetchone()
+    return [str(column["name"]) for column in columns if column["pk"]] if without_number else ["rowid"]
+
+
+def _of_rows(table: str, rows: list[Any], columns: list[Any], own: list[str]) -> Iterator[Edit]:
     of_key = [str(column["name"]) for column in columns if column["pk"]]
     names = [str(column["name"]) for column in columns]
+    where = " AND ".join(f"{name} = ?" for name in own)
     for row in rows:
         place = f"{table}, row {row['row_number']}"
-        delete = f'DELETE FROM "{table}" WHERE rowid = ?', (row["row_number"],)
+        this = tuple(row[name] for name in own)
+        delete = f'DELETE FROM "{table}" WHERE {where}', this
         yield Edit("row deleted", place, f"{table} -row", (delete,))
         for column in columns:
             name = str(column["name"])
             for value in _other_values(row[name], str(column["type"]), nullable=not column["notnull"]):
-                change = f'UPDATE "{table}" SET "{name}" = ? WHERE rowid = ?', (value, row["row_number"])
+                change = f'UPDATE "{table}" SET "{name}" = ? WHERE {where}', (value, *this)
                 shown = f"{place}: {name} = {value!r}"[:120]
                 yield Edit("column edited", shown, f"{table}.{name}", (change,))
         yield Edit("row inserted", f"a copy of {place}", f"{table} +row", (_copy(table, names, row, of_key),))
@@ -64,12 +75,12 @@ def _of_rows(table: str, rows: list[Any], columns: list[Any]) -> Iterator[Edit]:
             "rows exchanged",
             places,
             f"{table} order",
-            tuple(_exchanged(table, names, of_key, one, other)),
+            tuple(_exchanged(table, names, own, of_key, one, other)),
         )
         for name in names:
             if one[name] != other[name] and name not in of_key:
                 swap = tuple(
-                    (f'UPDATE "{table}" SET "{name}" = ? WHERE rowid = ?', (a[name], b["row_number"]))
+                    (f'UPDATE "{table}" SET "{name}" = ? WHERE {where}', (a[name], *(b[column] for column in own)))
                     for a, b in ((one, other), (other, one))
                 )
                 yield Edit("columns exchanged", f"{places}: {name}", f"{table}.{name}", swap)
@@ -115,11 +126,12 @@ def _copy(table: str, names: list[str], row: Any, of_key: list[str]) -> tuple[st
 
 
 def _exchanged(
-    table: str, names: list[str], of_key: list[str], one: Any, other: Any
+    table: str, names: list[str], own: list[str], of_key: list[str], one: Any, other: Any
 ) -> Iterator[tuple[str, tuple[Any, ...]]]:
     """Statements that swap the keys of two rows."""
+    where = " AND ".join(f"{name} = ?" for name in own)
     for row in (one, other):
-        yield f'DELETE FROM "{table}" WHERE rowid = ?', (row["row_number"],)
+        yield f'DELETE FROM "{table}" WHERE {where}', tuple(row[name] for name in own)
     listed, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" for _ in names)
     for row, place in ((one, other), (other, one)):
         values = tuple(place[name] if name in of_key else row[name] for name in names)
