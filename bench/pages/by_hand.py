@@ -21,7 +21,8 @@ from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 from playwright.sync_api import expect
 
 from bench.machine import REPOSITORY
-from tests.support.pages.browser import TABLET, Screen, Served, add_people, chromium, screen, served
+from tests.support.pages.accounts import add_people
+from tests.support.pages.browser import TABLET, Screen, Served, chromium, screen, served
 from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import simulated_rig

@@ -27,7 +27,8 @@ from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import recorded_run
 from service.store.store import Store
-from tests.support.pages.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people, chromium, screen, served
+from tests.support.pages.accounts import PASSWORD, add_people
+from tests.support.pages.browser import DESKTOP, TABLET, Screen, chromium, screen, served
 from tests.support.runs.attended import attended
 
 FOLDER = REPOSITORY / "build" / "screens"

@@ -9,12 +9,12 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from service.store.store import Store
+from tests.support.pages.accounts import add_people
 from tests.support.pages.browser import (
     DESKTOP,
     TABLET,
     Screen,
     accessibility_faults,
-    add_people,
     follow,
     screen,
     scripts_held_back,

@@ -13,7 +13,8 @@ from service.core.records.entered import NoteTaken
 from service.core.records.events import RunStarted
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.pages.browser import add_people, screen, served
+from tests.support.pages.accounts import add_people
+from tests.support.pages.browser import screen, served
 from tests.support.runs.bench_run import PROTOCOL
 
 pytestmark = [pytest.mark.timeout(300)]

@@ -16,10 +16,9 @@ from playwright.sync_api import Browser, Page, expect
 
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
+from tests.support.pages.accounts import PASSWORD, PIN, invite_people
 from tests.support.pages.browser import (
     DESKTOP,
-    PASSWORD,
-    PIN,
     Cable,
     Screen,
     Served,
@@ -27,7 +26,6 @@ from tests.support.pages.browser import (
     accessibility_faults,
     follow,
     invite_on_page,
-    invite_people,
     screen,
     served,
     set_up_administrator,

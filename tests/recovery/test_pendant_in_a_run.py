@@ -30,19 +30,28 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def do(act: Callable[[], None], run: OneArmRun, arm: ArmWatch, moment: str) -> None:
-    """Act once: on the way to the second view, or while it is exposed."""
+    """Act once: while the second view is exposed, or once the arm was seen on the way to it."""
     shutter = run.station.shutter
+    exposed: list[int] = []  # marks of the watch
     done: list[str] = []
 
-    def maybe(_: object) -> None:
-        if not done and (moment == "exposing" or (shutter.exposures == 1 and arm.now.speed_rad_s > 0.2)):
+    def once() -> None:
+        if not done:
             done.append(moment)
             act()
 
-    if moment == "exposing":
-        shutter.on_capture = lambda number: maybe(number) if number == 2 else None
-    else:
-        run.operator.on_attend = maybe
+    def captured(number: int) -> None:
+        exposed.append(arm.mark())
+        if moment == "exposing" and number == 2:
+            once()
+
+    def attend(_: object) -> None:
+        under_way = len(exposed) == 1 and any(seen.speed_rad_s > 0.2 for seen in arm.samples()[exposed[0] :])
+        if moment == "in motion" and under_way:
+            once()
+
+    shutter.on_capture = captured
+    run.operator.on_attend = attend
 
 
 def assert_true_poses(run: OneArmRun, arm: ArmWatch) -> None:

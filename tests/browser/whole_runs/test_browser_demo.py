@@ -13,7 +13,8 @@ import pytest
 import yaml
 from playwright.sync_api import Browser, Page, expect
 
-from tests.support.pages.browser import DESKTOP, PASSWORD, Served, add_people, follow, screen, served
+from tests.support.pages.accounts import PASSWORD, add_people
+from tests.support.pages.browser import DESKTOP, Served, follow, screen, served
 from tests.support.pages.technician import ANSWER_MS, Technician
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig

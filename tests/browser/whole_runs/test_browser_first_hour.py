@@ -21,7 +21,8 @@ import pytest
 from playwright.sync_api import Browser
 
 from service.people.person import Role
-from tests.support.pages.browser import PASSWORD, accept_on_page, invite_on_page, screen, set_up_administrator
+from tests.support.pages.accounts import PASSWORD
+from tests.support.pages.browser import accept_on_page, invite_on_page, screen, set_up_administrator
 from tests.support.pages.technician import Technician
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, RIG_LOCK

@@ -15,7 +15,8 @@ import pytest
 import yaml
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.support.pages.browser import PASSWORD, Screen, Served, add_people, screen, served
+from tests.support.pages.accounts import PASSWORD, add_people
+from tests.support.pages.browser import Screen, Served, screen, served
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, simulated_rig
 

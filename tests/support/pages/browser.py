@@ -11,7 +11,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,17 +22,13 @@ from axe_playwright_python.base import AXE_SCRIPT
 from playwright.sync_api import Browser, BrowserContext, Locator, Page, Route, expect, sync_playwright
 
 from service.people.person import Role
-from service.people.sessions import People
-from service.store.store import Store
+from tests.support.pages.accounts import PASSWORD, PIN
 from tests.support.processes.forked import Forked
-from tests.support.processes.quick_hashes import QuickHasher
 from tests.support.processes.runners import end_runners
 from tests.support.rig.rig import REPOSITORY, command
 
 TABLET = (1024, 768)
 DESKTOP = (1920, 1080)
-PASSWORD = "correct horse battery"
-PIN = "246810"
 _FAILURES = REPOSITORY / "build" / "browser-failures"  # screenshots of failed tests
 # The first is the same engine without the interface of a desktop browser, which costs three times as much.
 _NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -180,27 +176,6 @@ def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
     finally:
         server.end_runners()
         server.kill(signal.SIGTERM)
-
-
-def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
-    """Create accounts with PASSWORD and PIN as the pages do: an administrator invites, people accept."""
-    with Store.open(data) as store:
-        desk = People(store, QuickHasher())
-        desk.accounts.set_up(desk.first_link() or "", "ada", "Ada Example", PASSWORD, PIN)
-    invite_people(data, people)
-
-
-def invite_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
-    """Create further accounts of that kind: the administrator Ada is there already."""
-    with Store.open(data) as store:
-        desk = People(store, QuickHasher())
-        token = desk.sign_in("ada", PASSWORD)
-        administrator = desk.person(token, idle_lock_s=600, deliberate=True)
-        assert administrator is not None
-        for account, role in people:
-            link = desk.accounts.invite(administrator, account, f"{account.title()} Example", role)
-            desk.accounts.accept(link, PASSWORD, PIN)
-        desk.sign_out(administrator)
 
 
 def fill_secrets(page: Page) -> None:

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import httpx
 
+from tests.support.pages.accounts import PASSWORD, PIN
 from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command
-
-PASSWORD = "correct horse battery"
 
 
 @dataclass
@@ -33,7 +32,7 @@ class Server:
 
     def signed_in(self) -> dict[str, str]:
         """Request headers of the first administrator, whose account is created by the first set-up."""
-        secret = {"password": PASSWORD, "repeated": PASSWORD, "pin": "2468"}
+        secret = {"password": PASSWORD, "repeated": PASSWORD, "pin": PIN}
         made = httpx.post(self.set_up, data={"account": "ada", "full_name": "Ada Lovelace", **secret}, timeout=30)
         assert made.status_code == 303, made.text
         form = {"account": "ada", "password": PASSWORD}

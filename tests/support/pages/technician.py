@@ -12,7 +12,8 @@ from typing import Any
 from playwright.sync_api import Locator, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
-from tests.support.pages.browser import PASSWORD, Screen
+from tests.support.pages.accounts import PASSWORD
+from tests.support.pages.browser import Screen
 from tests.support.processes.waiting import until
 
 MOST_MENDS = 4  # per step, as of the automatic operator

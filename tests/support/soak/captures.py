@@ -26,7 +26,8 @@ from service.followed_run import RunFollower
 from service.run_start import recorded_run
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.pages.serving import PASSWORD, Server, serving
+from tests.support.pages.accounts import PASSWORD, invite_people
+from tests.support.pages.serving import Server, serving
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 from tests.support.soak.creep import CHILD, FEWEST, Sample, judge, warmed_up
 from tests.support.soak.person import Typist
@@ -126,9 +127,10 @@ class _Soak:
         """Run, read pages and sample until the time is up and there are enough samples; then end all processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         headers = self.server.signed_in()
+        invite_people(self.data, [("tina", "technician")])
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
-                command(*words, "--operator", "ada", "--password-stdin", "--specimen", "soak", "--json"),
+                command(*words, "--operator", "tina", "--password-stdin", "--specimen", "soak", "--json"),
                 cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
         try:
