@@ -31,6 +31,7 @@ from service.store.store import Store
 from service.store.verification.anchor_checks import ReadAnchors, RecordSide, compare
 from service.store.verification.verify import AuditReport, verify
 from tests.support.processes.object_store import Weed
+from tests.support.processes.postgres import Cluster
 from tests.support.record.store import start_run
 
 LOCKED_DAYS = 2
@@ -349,3 +350,44 @@ def test_an_uploader_says_at_once_that_the_log_was_rolled_back(site: Site) -> No
     said = CliRunner().invoke(app, ["store", "upload", "--data", str(site.data)])
     assert said.exit_code == 1
     assert "that the log of signatures does not have" in " ".join(said.output.split())
+
+
+@pytest.mark.slow
+@pytest.mark.packages("postgresql")
+@pytest.mark.sqlite("shares the database of a server by itself")
+def test_a_folder_that_does_not_sign_compares_the_ends_of_chains_and_says_what_it_cannot(
+    weed: Weed, bucket: str, tmp_path: Path
+) -> None:
+    """Two folders share a site's database and object store; the log of signatures is in the first."""
+    cluster = Cluster(brief=True)
+    cluster.start()
+    try:
+        first, second = tmp_path / "first", tmp_path / "second"
+        objects = weed.write_site(first, bucket=bucket, lock_days=LOCKED_DAYS)
+        site = Site(first, objects, weed)
+        database = cluster.new_database()
+        of_site = yaml.safe_load((first / "site.yaml").read_text()) | {"database": cluster.address(database)}
+        (first / "site.yaml").write_text(yaml.safe_dump(of_site))
+        run_id = site.sign_another_run()
+        site.anchor()
+        second.mkdir(mode=0o700)
+        for name in ("site.yaml", "store_keys.yaml"):
+            shutil.copy(first / name, second)
+        shutil.copytree(first / "artefacts", second / "artefacts")
+        report = verify(second)
+        assert report.ok, report.faults
+        assert not report.verified, "the log's lines were compared with nothing"
+        assert report.anchors is not None
+        assert (report.anchors.lines, report.anchors.roots, report.anchors.heads) == (0, 1, 2)
+        assert report.anchors.lines_not_compared == len(site.lines())
+        assert f"the log of signatures is in {first} on " in report.not_compared[0]
+        cluster.run(
+            database,
+            "ALTER TABLE events DISABLE TRIGGER ALL",
+            f"UPDATE events SET sha256 = reverse(sha256) WHERE run_id = '{run_id}'",
+            "ALTER TABLE events ENABLE TRIGGER ALL",
+        )
+        faults = verify(second).faults
+        assert any(fault.run_id == run_id and "the root of" in fault.what for fault in faults), faults
+    finally:
+        cluster.stop()

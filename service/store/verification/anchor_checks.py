@@ -78,13 +78,13 @@ class RecordSide:
     """The side of the record in the comparison: the log of signatures, its keys and the chains.
 
     Attributes:
-        lines: the log's lines, oldest first.
+        lines: the log's lines, oldest first; None if it is in another data folder, which signs the site.
         chains: the chains that were read.
         keys: raw public keys by fingerprint.
         every_run: true if every chain was read, so that one that is missing was deleted.
     """
 
-    lines: Sequence[LogLine]
+    lines: Sequence[LogLine] | None
     chains: Mapping[str, ChainFacts]
     keys: Mapping[str, bytes]
     every_run: bool
@@ -106,7 +106,8 @@ def compare(anchors: ReadAnchors, record: RecordSide) -> AnchorFindings:
         found.faults.append(
             _fault(anchors, name, "this is no anchor that this software writes: somebody else put it")
         )
-    _compare_lines(found, anchors, record, lines)
+    if record.lines is not None:
+        _compare_lines(found, anchors, record, record.lines, lines)
     heads = _compare_roots(found, anchors, record, days)
     _note_days(found, anchors, record, sorted(days))
     if anchors.deletions:
@@ -117,7 +118,7 @@ def compare(anchors: ReadAnchors, record: RecordSide) -> AnchorFindings:
             "versions are still there and were compared"
         )
     found.counts = AnchorCounts(
-        lines=sum(number in lines for number in range(1, len(record.lines) + 1)), roots=len(days), heads=heads
+        lines=sum(number in lines for number in range(1, len(record.lines or ()) + 1)), roots=len(days), heads=heads
     )
     return found
 
@@ -127,6 +128,14 @@ def not_compared(place: str, why: str, lines: int, heads: int) -> str:
     return (
         f"{counted(lines, 'line')} of {LOG_NAME} and the ends of {counted(heads, 'chain')} are not compared, because "
         f"the anchors in {place} cannot be read: {why}. What only they would show was NOT verified"
+    )
+
+
+def lines_not_compared(place: str, where: str, lines: int) -> str:
+    """Return the sentence on a log of signatures that is elsewhere, so that its anchors cannot be compared."""
+    return (
+        f"{counted(lines, 'line')} of {LOG_NAME} {'is' if lines == 1 else 'are'} not compared with the anchors in "
+        f"{place}, because {where}. What only they would show was NOT verified: verify there too"
     )
 
 
@@ -170,7 +179,11 @@ def _text(at: datetime) -> str:
 
 
 def _compare_lines(
-    found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, held: Mapping[int, Sequence[LockedVersion]]
+    found: AnchorFindings,
+    anchors: ReadAnchors,
+    record: RecordSide,
+    lines: Sequence[LogLine],
+    held: Mapping[int, Sequence[LockedVersion]],
 ) -> None:
     """Compare every line of the log with its anchor, and look for anchors of lines that are gone."""
     beyond: list[int] = []
@@ -179,22 +192,22 @@ def _compare_lines(
         name = versions[-1].listed.name
         if anchor is None:
             found.faults.append(_fault(anchors, name, "this is not the anchor of a line: somebody else put it"))
-        elif number > len(record.lines):
+        elif number > len(lines):
             if _ours(anchor.line, number, record):
                 beyond.append(number)
             else:
                 what = f"{LOG_NAME} has no line {number}, and no key of this record signed it: somebody else put it"
                 found.faults.append(_fault(anchors, name, f"{what}, or the record was replaced"))
-        elif record.lines[number - 1].raw.decode(errors="replace") != anchor.line:
+        elif lines[number - 1].raw.decode(errors="replace") != anchor.line:
             where = f"{LOG_NAME}, line {number}"
             found.faults.append(Fault(None, None, where, f"it is not the line that {name} in {anchors.place} holds"))
     if beyond:
         what = (
-            f"{LOG_NAME} ends after line {len(record.lines)}, and the object store holds anchors up to line "
+            f"{LOG_NAME} ends after line {len(lines)}, and the object store holds anchors up to line "
             f"{beyond[-1]}, signed with a key of this record: it was rolled back, and the record perhaps with it"
         )
         found.faults.append(Fault(None, None, LOG_NAME, what))
-    _check_missing(found, anchors, record, held)
+    _check_missing(found, anchors, lines, held)
 
 
 def _ours(line: str, number: int, record: RecordSide) -> bool:
@@ -205,13 +218,16 @@ def _ours(line: str, number: int, record: RecordSide) -> bool:
 
 
 def _check_missing(
-    found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, held: Mapping[int, Sequence[LockedVersion]]
+    found: AnchorFindings,
+    anchors: ReadAnchors,
+    lines: Sequence[LogLine],
+    held: Mapping[int, Sequence[LockedVersion]],
 ) -> None:
     """List the lines without an anchor: too new for one, too old for the lock, or neither, which is a fault."""
     waiting: list[datetime] = []
     over: list[int] = []
     late: list[int] = []
-    for line in record.lines:
+    for line in lines:
         if line.checkpoint is None:
             continue  # a fault of the log
         signed_at = _time(line.checkpoint.at_utc)
@@ -317,7 +333,7 @@ def _signed(anchor: RootAnchor, keys: Mapping[str, bytes]) -> bool:
 def _note_days(found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, days: Sequence[date]) -> None:
     """Add a note on the days without a root since the first one, and on the longest gap."""
     if not days:
-        if record.lines:
+        if record.lines is None or record.lines:
             found.notes.append("no day has a root in the object store yet")
         return
     today = anchors.at.date()

@@ -36,6 +36,7 @@ from service.store.verification.anchor_checks import (
     ReadAnchors,
     RecordSide,
     compare,
+    lines_not_compared,
     not_compared,
 )
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
@@ -228,16 +229,15 @@ def _verify(
     if outside.lines is None:
         with suppress(IntegrityError):  # an event that was altered is a fault of its chain
             named = signer_elsewhere(connection, data_dir)
+    elsewhere = ""
     if named is not None and in_another_place(named, data_dir):
         of_log: list[Fault] = []
-        where = f"the log of signatures is in {named.folder} on {named.host}"
-        said_of_log = [f"{where}: a verification there reads it"]
-        if isinstance(outside.anchors, ReadAnchors):  # of the lines that are not here
-            outside = replace(outside, anchors=UnreadAnchors(outside.anchors.place, where))
+        elsewhere = f"the log of signatures is in {named.folder} on {named.host}"
+        said_of_log = [f"{elsewhere}: a verification there reads it"]
     else:
         of_log, said_of_log = _log_findings(outside.lines, evidence, site, keys, run_id)
     every_run = run_id is None
-    anchored, unread = _anchor_findings(outside, chains, keys, evidence, every_run=every_run)
+    anchored, unread = _anchor_findings(outside, elsewhere, chains, keys, evidence, every_run=every_run)
     unread = (*unread_files((files or {}).values()), *unread)
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [
@@ -278,13 +278,17 @@ def _log_findings(
 
 def _anchor_findings(
     outside: _Outside,
+    elsewhere: str,
     chains: Mapping[str, ChainFacts],
     keys: signatures.Keys,
     evidence: EvidenceRows,
     *,
     every_run: bool,
 ) -> tuple[AnchorFindings, tuple[str, ...]]:
-    """Return what the anchors in the object store show, and sentences on what could not be compared with them."""
+    """Return what the anchors in the object store show, and sentences on what could not be compared with them.
+
+    `elsewhere` says where the log of signatures is, if another data folder has it: then only chains are compared.
+    """
     anchors, lines = outside.anchors, outside.lines or []
     if anchors is None:
         return AnchorFindings(), ()
@@ -293,7 +297,12 @@ def _anchor_findings(
         said = not_compared(anchors.place, anchors.why, counts.lines_not_compared, counts.heads_not_compared)
         return AnchorFindings(counts=counts), (said,)
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
-    return compare(anchors, RecordSide(lines, chains, public_keys, every_run)), ()
+    if not elsewhere:
+        return compare(anchors, RecordSide(lines, chains, public_keys, every_run)), ()
+    found = compare(anchors, RecordSide(None, chains, public_keys, every_run))
+    signed = sum(map(len, evidence.checkpoints.values()))
+    found.counts = replace(found.counts, lines_not_compared=signed)
+    return found, (lines_not_compared(anchors.place, elsewhere, signed),)
 
 
 def _check_chains(
