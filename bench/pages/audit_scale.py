@@ -96,7 +96,7 @@ def appending(folder: Path) -> dict[str, dict[str, float]]:
     for name, indexed in (("without_index", False), ("with_index", True), ("with_index_in_large", True)):
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             store = Store.open(folder / "data" if name.endswith("large") else Path(scratch))
-            index = contextlib.nullcontext() if indexed else mock.patch("service.store.events.index_event")
+            index = contextlib.nullcontext() if indexed else mock.patch("service.store.events.index_events")
             with store, index:
                 run = start_small_run(store)
                 found[name] = _append_ms(store, run)
