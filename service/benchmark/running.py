@@ -19,15 +19,16 @@ import psutil
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import Command, Method, Workplace, missing, place_of
 from service.benchmark.programs import measured
-from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Scenario, Score
+from service.benchmark.records import RESULT
 from service.benchmark.scoring import score_mesh, write_scored
+from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Scenario, Score
 from service.compute.ground_truth.chamfer import ChamferSettings
 from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
 from service.dataset.exported import scaled_data_set
 from service.dataset.exporter import exporter, write_data_set
-from service.dataset.records import DataSet
+from service.dataset.records import DataSet, Mesh
 from service.machine.resources import processor_model
 from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
@@ -110,6 +111,7 @@ def _gpu() -> str:
 
 
 _IDENTITY = "identity.txt"
+OUTPUT = "output.txt"  # of the method's commands
 Progress = Callable[[str, int, int], None]
 
 
@@ -167,10 +169,7 @@ def run_trial(
     _export(trial, dataset, place.data)
     commands = trial.method.commands(place)
     mesh, effort, failure = _mesh(trial, place, commands, progress)
-    truth = truth_file(trial.out, whole.identity)
-    if not truth.is_file():
-        comments = list(filter(None, ("world frame, metres", whole.mark)))
-        write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, comments)
+    write_truth(trial.out, whole.identity, whole.mesh, whole.mark)
     score, sha256, faces = _scored(trial, mesh, dataset, progress) if mesh is not None else (None, "", 0)
     result = BenchmarkResult(
         method=trial.method.name,
@@ -189,9 +188,19 @@ def run_trial(
         failure=failure,
         machine=this_machine(),
         finished_utc=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        version="" if effort is None else trial.method.version(),
+        random=trial.method.random,
     )
-    _keep(trial.folder / RESULT, result)
+    write_result(trial.folder, result)
     return result
+
+
+def write_truth(out: Path, dataset_sha256: str, mesh: Mesh, mark: str) -> None:
+    """Write a data set's ground truth beside the results, unless it is there."""
+    truth = truth_file(out, dataset_sha256)
+    if not truth.is_file():
+        comments = list(filter(None, ("world frame, metres", mark)))
+        write_ply(truth, Surface(mesh.vertices_m, mesh.faces), 1.0, {}, comments)
 
 
 def truth_file(out: Path, dataset_sha256: str) -> Path:
@@ -243,7 +252,7 @@ def _run(trial: Trial, place: Workplace, commands: tuple[Command, ...]) -> tuple
     if place.work.exists():
         shutil.rmtree(place.work)
     place.work.mkdir()
-    effort = run_commands(commands, place.work, trial.folder / "output.txt")
+    effort = run_commands(commands, place.work, trial.folder / OUTPUT)
     return effort, trial.method.mesh(place)
 
 
@@ -260,7 +269,9 @@ def _scored(trial: Trial, mesh: Path, dataset: DataSet, progress: Progress) -> t
     return scored.score, hash_file(mesh)[0], len(file.faces)
 
 
-def _keep(path: Path, result: BenchmarkResult) -> None:
+def write_result(folder: Path, result: BenchmarkResult) -> None:
+    """Write a result into its folder, durably."""
+    path = folder / RESULT
     part = path.with_suffix(".part")
     part.write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
     DurableFiles().sync_file(part)
