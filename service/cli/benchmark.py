@@ -143,12 +143,12 @@ def _run_of_site(
     )
 
     asked = ask_for_benchmark(store, run_id, how, wanted, actor=actor)
-    answered = None
+    result = None
     if out is not None:
         with progress_bar(quiet=json) as progress:
             answered = wait_for_benchmark(asked, progress, quiet=json)
-    if answered is not None and out is not None:
-        result = written_answer(asked, answered, out)
+            result = None if answered is None else written_answer(asked, answered, out, progress)
+    if result is not None and out is not None:
         _print_result(result, how, out / f"{result.method}-{result.scenario}", json=json)
     elif json:
         print_json({"run": run_id, "job": asked.job.job_id})

@@ -11,18 +11,20 @@ from service.benchmark.recorded import WantedBenchmark, benchmark_job, write_ans
 from service.cli.common import console, error_console
 from service.cli.stop_request import stop_requested
 from service.computations.benchmark import KIND, BenchmarkResult
-from service.core.errors import ComputeError
+from service.core.errors import ComputeError, IntegrityError
 from service.core.records.events import JobFailed, JobFinished
 from service.core.text.words import counted, time_here
 from service.dataset.summary import summarise
 from service.monitor.snapshot import living_workers
 from service.run_start import recorded_run
+from service.store.data_folder import object_store_of
 from service.store.records import Job
 from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 
 Progress = Callable[[str, int, int], None]
 _LOOK_S = 1.0
+_ARRIVES_S = 300.0  # within which files of an answer must have been uploaded
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +78,26 @@ def wait_for_benchmark(asked: AskedBenchmark, progress: Progress, *, quiet: bool
     return end
 
 
-def written_answer(asked: AskedBenchmark, answered: JobFinished, out: Path) -> BenchmarkResult:
-    """Write the answer into the folder of results, and return it."""
+def written_answer(asked: AskedBenchmark, answered: JobFinished, out: Path, progress: Progress) -> BenchmarkResult:
+    """Write the answer into the folder of results, and return it.
+
+    Where a site has an object store, its files arrive there after the answer: they are waited for.
+
+    Raises:
+        IntegrityError: a file does not arrive, or is altered.
+    """
     store, run_id = asked.store, asked.job.run_id
-    return write_answer(summarise(store, run_id, recorded_run(store, run_id)[0]), answered, out)
+    run = summarise(store, run_id, recorded_run(store, run_id)[0])
+    arrives = object_store_of(store.database_path.parent) is not None
+    until_s = store.clock.monotonic_s() + (_ARRIVES_S if arrives else 0.0)
+    while True:
+        try:
+            return write_answer(run, answered, out)
+        except IntegrityError:
+            if store.clock.monotonic_s() >= until_s:
+                raise
+            progress(f"waits for the files of the answer, which {answered.worker} uploads", 0, 0)
+            store.clock.sleep(_LOOK_S)
 
 
 def report_left(asked: AskedBenchmark) -> None:

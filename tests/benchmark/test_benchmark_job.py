@@ -6,22 +6,16 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Generator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
-import numpy as np
 import psutil
 import pytest
-import trimesh
 from typer.testing import CliRunner
 
 from service.audit.record.run import read_run
 from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, replay
 from service.cli.main import app
-from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, RunCompleted
+from service.core.records.events import JobEnqueued, JobFailed, JobFinished, RunCompleted
 from service.monitor.snapshot import living_workers
 from service.store.durable_effects import SystemClock
 from service.store.store import Store
@@ -29,84 +23,20 @@ from service.store.verification.verify import verify
 from service.web.dataset.pages import benchmark_of
 from service.worker.loop import work
 from tests.support.processes.forked import Forked
-from tests.support.processes.method_plugin import AT_RANDOM, ENDLESS, MODULE, TRUTH, method_plugin
+from tests.support.processes.method_plugin import AT_RANDOM, ENDLESS, TRUTH
 from tests.support.processes.waiting import until
 from tests.support.record.grants import write_grant
-from tests.support.recorded.unpacked_run import unpack_recorded_run
+from tests.support.recorded.benchmarked_run import ASKED, METHOD, BenchmarkedRun, unpack_benchmarked_run
 from tests.support.rig.rig import REPOSITORY
 
-_Payload = TypeVar("_Payload", JobEnqueued, JobFailed, JobFinished)
-METHOD, SHIFT_M = "shifted-truth", 5e-4
-ASKED = ("--scenario", "sparse", "--width", "200", "--spacing-mm", "2", "--operator", "Erika")
 
-
-@dataclass(frozen=True)
-class Site:
-    """A data folder with a completed run, and a package with a method, which only some machines have."""
-
-    folder: Path
-
-    @property
-    def data(self) -> Path:
-        return self.folder / "data"
-
-    @contextmanager
-    def machine(self, *, method: bool, truth: bool = True) -> Generator[None]:
-        """Be a machine with or without the package, and with or without what the method needs besides."""
-        with pytest.MonkeyPatch.context() as patch:
-            if method:
-                patch.syspath_prepend(str(self.folder / "package"))
-            if truth:
-                patch.setenv(TRUTH, str(self.folder / "truth.ply"))
-            try:
-                yield
-            finally:
-                sys.modules.pop(MODULE, None)
-
-    def call(self, *command: str) -> tuple[int, Any]:
-        """The exit status of a command, and what it prints with --json."""
-        done = CliRunner().invoke(app, [*command, "--data", str(self.data), "--json"], catch_exceptions=False)
-        return done.exit_code, json.loads(done.stdout)
-
-    def ask(self, *command: str, method: str = METHOD) -> dict[str, Any]:
-        """Ask for a benchmark of the run, and do not wait."""
-        with self.machine(method=True, truth=False):
-            status, printed = self.call(
-                "benchmark", "run", "latest", "--method", method, *ASKED, "--no-wait", *command
-            )
-        assert status == 0, printed
-        return printed
-
-    def cancel(self, job: str) -> None:
-        """End a benchmark by a person's decision."""
-        assert self.call("cancel", job, "--reason", "asked by mistake", "--operator", "Erika")[0] == 0
-
-    def worker(self, **has: bool) -> int:
-        """The number of jobs that a worker of this machine computes until none is left for it."""
-        with self.machine(**has), Store.open(self.data) as store:
-            return work(store, until_idle=True, stop=lambda: False, progress=lambda *_: None)
-
-    def event(self, kind: type[_Payload], job: str) -> tuple[Event, _Payload]:
-        """The event of a kind that names a job, and its payload."""
-        with Store.open(self.data) as store:
-            found = store.events(store.find_run("latest"))
-        ((event, payload),) = [(e, e.payload) for e in found if isinstance(e.payload, kind) and e.payload.job == job]
-        return event, payload
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> BenchmarkedRun:
+    return unpack_benchmarked_run(tmp_path_factory.mktemp("site"))
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    folder = tmp_path_factory.mktemp("site")
-    unpack_recorded_run(folder)
-    method_plugin(folder / "package")
-    mesh = read_run(folder / "data", "latest").summary().ground_truth().mesh
-    shifted_m = mesh.vertices_m + np.array([0.0, 0.0, SHIFT_M])
-    trimesh.Trimesh(shifted_m, mesh.faces, process=False).export(folder / "truth.ply")
-    return Site(folder)
-
-
-@pytest.fixture(scope="module")
-def answers(site: Site) -> tuple[JobFinished, JobFinished]:
+def answers(site: BenchmarkedRun) -> tuple[JobFinished, JobFinished]:
     """The answers to two benchmarks that two workers without the method have left to a third one.
 
     The second is of a method that makes another mesh each time.
@@ -127,7 +57,9 @@ def answer(answers: tuple[JobFinished, JobFinished]) -> JobFinished:
 
 
 @pytest.mark.slow
-def test_the_machine_with_the_method_answers_and_the_answer_is_evidence(site: Site, answer: JobFinished) -> None:
+def test_the_machine_with_the_method_answers_and_the_answer_is_evidence(
+    site: BenchmarkedRun, answer: JobFinished
+) -> None:
     result = answer.result
     assert (result["method"], result["version"], result["views"], result["width"]) == (METHOD, "1.2", 5, 200)
     assert result["effort"]["wall_s"] > 0
@@ -150,7 +82,9 @@ def test_the_machine_with_the_method_answers_and_the_answer_is_evidence(site: Si
 
 
 @pytest.mark.slow
-def test_a_replay_compares_the_mesh_or_says_why_not(site: Site, answers: tuple[JobFinished, JobFinished]) -> None:
+def test_a_replay_compares_the_mesh_or_says_why_not(
+    site: BenchmarkedRun, answers: tuple[JobFinished, JobFinished]
+) -> None:
     def replayed(*, truth: bool) -> list[JobReplay]:
         with site.machine(method=True, truth=truth):
             report = replay(read_run(site.data, "latest"), kinds=["benchmark"], progress=lambda *_: None)
@@ -168,7 +102,7 @@ def test_a_replay_compares_the_mesh_or_says_why_not(site: Site, answers: tuple[J
 
 
 @pytest.mark.slow
-def test_an_exported_folder_has_the_same_score(site: Site, answer: JobFinished, tmp_path: Path) -> None:
+def test_an_exported_folder_has_the_same_score(site: BenchmarkedRun, answer: JobFinished, tmp_path: Path) -> None:
     with site.machine(method=True):
         status, printed = site.call("export", "latest", "--format", "hdf5", "--out", str(tmp_path / "dataset"))
         assert status == 0, printed
@@ -182,7 +116,7 @@ def test_an_exported_folder_has_the_same_score(site: Site, answer: JobFinished, 
 
 @pytest.mark.slow
 def test_the_command_waits_for_the_answer_and_writes_it_as_that_of_a_folder(
-    site: Site, answer: JobFinished, tmp_path: Path
+    site: BenchmarkedRun, answer: JobFinished, tmp_path: Path
 ) -> None:
     ended = threading.Event()
 
@@ -211,7 +145,9 @@ def test_the_command_waits_for_the_answer_and_writes_it_as_that_of_a_folder(
 
 
 @pytest.mark.slow
-def test_a_method_that_is_gone_fails_its_job_as_it_fails_the_command_and_the_run_goes_on(site: Site) -> None:
+def test_a_method_that_is_gone_fails_its_job_as_it_fails_the_command_and_the_run_goes_on(
+    site: BenchmarkedRun,
+) -> None:
     asked = site.ask("--width", "100")
     truth, gone = site.folder / "truth.ply", site.folder / "gone.ply"
 
@@ -232,7 +168,7 @@ def test_a_method_that_is_gone_fails_its_job_as_it_fails_the_command_and_the_run
     assert verify(site.data).ok
 
 
-def test_a_job_that_nobody_waits_for_is_printed_with_what_it_waits_for(site: Site) -> None:
+def test_a_job_that_nobody_waits_for_is_printed_with_what_it_waits_for(site: BenchmarkedRun) -> None:
     command = ["benchmark", "run", "latest", "--method", METHOD, *ASKED, "--spacing-mm", "5", "--no-wait"]
     with site.machine(method=True, truth=False):
         done = CliRunner().invoke(app, [*command, "--data", str(site.data)], catch_exceptions=False)
@@ -244,7 +180,7 @@ def test_a_job_that_nobody_waits_for_is_printed_with_what_it_waits_for(site: Sit
     assert site.event(JobFailed, job)[1].message == "Erika cancelled it: asked by mistake"
 
 
-def test_a_machine_computes_one_benchmark_at_a_time(site: Site) -> None:
+def test_a_machine_computes_one_benchmark_at_a_time(site: BenchmarkedRun) -> None:
     asked = site.ask("--spacing-mm", "6")
     theirs = write_grant(site.data / "monitor" / "memory", os.getppid(), "theirs", 100, alone=True)
     try:
@@ -255,7 +191,7 @@ def test_a_machine_computes_one_benchmark_at_a_time(site: Site) -> None:
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_takes_the_methods_process_with_it(site: Site, tmp_path: Path) -> None:
+def test_a_worker_that_is_killed_takes_the_methods_process_with_it(site: BenchmarkedRun, tmp_path: Path) -> None:
     asked, started = site.ask("--spacing-mm", "7"), tmp_path / "pid"
     path = os.pathsep.join([str(site.folder / "package"), str(REPOSITORY)])
     has = {TRUTH: str(site.folder / "truth.ply"), ENDLESS: str(started), "PYTHONPATH": path}
@@ -273,7 +209,7 @@ def test_a_worker_that_is_killed_takes_the_methods_process_with_it(site: Site, t
     site.cancel(asked["job"])
 
 
-def test_what_cannot_be_a_job_is_refused(site: Site, tmp_path: Path) -> None:
+def test_what_cannot_be_a_job_is_refused(site: BenchmarkedRun, tmp_path: Path) -> None:
     def refused(*command: str) -> str:
         status, printed = site.call("benchmark", "run", *command)
         assert status == 1
