@@ -8,7 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,6 +29,7 @@ from service.core.units import gigabytes, megabytes
 from service.dataset.exported import scaled_data_set
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.records import DataSet, Mesh
+from service.machine.executors import VARIABLE
 from service.machine.resources import processor_model
 from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
@@ -37,7 +38,9 @@ _LAST_LINES = 12  # of a failed program's output, for the message
 _ANSWER_S = 10.0  # that the NVIDIA driver may take to name its GPU
 
 
-def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> ComputingEffort:
+def run_commands(
+    commands: tuple[Command, ...], work: Path, log: Path, environment: Mapping[str, str] = os.environ
+) -> ComputingEffort:
     """Run commands one after the other in a folder, with their output in a file.
 
     Raises:
@@ -47,7 +50,7 @@ def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Comput
     wall_s = cpu_s = peak_bytes = 0.0
     log.write_bytes(b"")
     for command in commands:
-        took = _measured(command, work, log)
+        took = _measured(command, work, log, environment)
         wall_s += took["wall_s"]
         cpu_s += took["cpu_s"]
         peak_bytes = max(peak_bytes, took["peak_bytes"])
@@ -63,7 +66,7 @@ def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Comput
     )
 
 
-def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
+def _measured(command: Command, work: Path, log: Path, environment: Mapping[str, str]) -> dict[str, Any]:
     """Run a command, and return its status and what it took, as `programs/measured.py` says it."""
     reading, writing = os.pipe()
     with log.open("ab") as output, os.fdopen(reading, "rb") as said:
@@ -72,7 +75,8 @@ def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
         try:
             process = subprocess.Popen(
                 [sys.executable, "-I", "-S", measured.__file__, str(writing), *command],
-                cwd=work, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, pass_fds=(writing,),
+                cwd=work, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                pass_fds=(writing,),
             )  # fmt: skip
         finally:
             os.close(writing)
@@ -126,6 +130,7 @@ class Trial:
         mesh: a mesh made elsewhere, as the method writes it; None to run the method here.
         width: the images' width in pixels; 0 for that of the data set.
         settings: the settings of the comparison.
+        here_alone: the commands do not see the cluster that the environment names.
     """
 
     method: Method
@@ -134,6 +139,7 @@ class Trial:
     mesh: Path | None = None
     width: int = 0
     settings: ChamferSettings = field(default_factory=ChamferSettings)
+    here_alone: bool = False
 
     @property
     def folder(self) -> Path:
@@ -252,7 +258,9 @@ def _run(trial: Trial, place: Workplace, commands: tuple[Command, ...]) -> tuple
     if place.work.exists():
         shutil.rmtree(place.work)
     place.work.mkdir()
-    effort = run_commands(commands, place.work, trial.folder / OUTPUT)
+    cluster = VARIABLE if trial.here_alone else ""
+    environment = {name: value for name, value in os.environ.items() if name != cluster}
+    effort = run_commands(commands, place.work, trial.folder / OUTPUT, environment)
     return effort, trial.method.mesh(place)
 
 

@@ -22,7 +22,7 @@ def benchmark(context: JobContext[Arguments]) -> JobAnswer:
     context.progress("reading the run", 0, 0)
     whole = data_set_of_record(context.events(arguments.run), context.store, arguments)
     settings = ChamferSettings(arguments.spacing_m)
-    trial = Trial(method, arguments.scenario, context.scratch, width=arguments.width, settings=settings)
+    trial = Trial(method, arguments.scenario, context.scratch, None, arguments.width, settings, here_alone=True)
     with computing_on(LocalProcesses()):
         result = run_trial(trial, whole, context.progress)
     score, folder = result.score, trial.folder

@@ -46,7 +46,7 @@ def method_plugin(folder: Path) -> Path:
 
 
 def main() -> None:
-    """Write the mesh, with the hash of the images in its header: it is another one if these differ in a bit."""
+    """Write the mesh. Its header has the hash of the images, and the cluster that the environment names."""
     if ENDLESS in os.environ:
         Path(os.environ[ENDLESS]).write_text(str(os.getpid()))
         signal.pause()
@@ -55,7 +55,8 @@ def main() -> None:
     for path in sorted((data / "images").iterdir()):
         images.update(path.name.encode() + path.read_bytes())
     head, end, body = Path(os.environ[TRUTH]).read_bytes().partition(b"end_header\n")
-    mesh.write_bytes(head + f"comment images {images.hexdigest()}\n".encode() + end + body)
+    seen = f"comment images {images.hexdigest()}, scheduler {os.environ.get('ORTHOCAPTURE_SCHEDULER')}\n"
+    mesh.write_bytes(head + seen.encode() + end + body)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from service.audit.record.run import read_run
 from service.cli.main import app
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished
+from service.machine.executors import VARIABLE
 from service.store.store import Store
 from service.worker.loop import work
 from tests.support.processes.method_plugin import MODULE, TRUTH, method_plugin
@@ -36,13 +37,18 @@ class BenchmarkedRun:
     data: Path
 
     @contextmanager
-    def machine(self, *, method: bool, truth: bool = True) -> Generator[None]:
-        """Be a machine with or without the package, and with or without what the method needs besides."""
+    def machine(self, *, method: bool, truth: bool = True, scheduler: str = "") -> Generator[None]:
+        """Be a machine with or without the package, and with or without what the method needs besides.
+
+        `scheduler`: the address of the cluster that the environment names.
+        """
         with pytest.MonkeyPatch.context() as patch:
             if method:
                 patch.syspath_prepend(str(self.folder / "package"))
             if truth:
                 patch.setenv(TRUTH, str(self.folder / "truth.ply"))
+            if scheduler:
+                patch.setenv(VARIABLE, scheduler)
             try:
                 yield
             finally:
@@ -66,9 +72,9 @@ class BenchmarkedRun:
         """End a benchmark by a person's decision."""
         assert self.call("cancel", job, "--reason", "asked by mistake", "--operator", "Erika")[0] == 0
 
-    def worker(self, data: Path | None = None, **has: bool) -> int:
+    def worker(self, data: Path | None = None, *, scheduler: str = "", **has: bool) -> int:
         """The number of jobs that a worker of a machine computes until none is left for it, here or on a folder."""
-        with self.machine(**has), Store.open(data or self.data) as store:
+        with self.machine(**has, scheduler=scheduler), Store.open(data or self.data) as store:
             return work(store, until_idle=True, stop=lambda: False, progress=lambda *_: None)
 
     def event(self, kind: type[_Payload], job: str) -> tuple[Event, _Payload]:
