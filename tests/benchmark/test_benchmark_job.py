@@ -168,6 +168,25 @@ def test_a_method_that_is_gone_fails_its_job_as_it_fails_the_command_and_the_run
     assert verify(site.data).ok
 
 
+def test_a_method_that_makes_no_mesh_has_an_answer_with_what_it_printed(site: BenchmarkedRun) -> None:
+    asked = site.ask("--spacing-mm", "8")
+    truth, away = site.folder / "truth.ply", site.folder / "away.ply"
+    truth.rename(away)
+    truth.touch()
+    try:
+        assert site.worker(method=True) == 1
+    finally:
+        away.replace(truth)
+    _, end = site.event(JobFinished, asked["job"])
+    assert end.result["score"] is None
+    assert "nothing to copy" in end.result["failure"]
+    assert "Its whole output is in output.txt" in end.result["failure"]
+    (output,) = end.artefacts
+    with Store.open(site.data) as store:
+        printed = store.artefact_path(output.sha256).read_text(encoding="utf-8")
+    assert printed.splitlines()[-1] == "nothing to copy"
+
+
 def test_a_job_that_nobody_waits_for_is_printed_with_what_it_waits_for(site: BenchmarkedRun) -> None:
     command = ["benchmark", "run", "latest", "--method", METHOD, *ASKED, "--spacing-mm", "5", "--no-wait"]
     with site.machine(method=True, truth=False):

@@ -55,6 +55,8 @@ def main() -> None:
     for path in sorted((data / "images").iterdir()):
         images.update(path.name.encode() + path.read_bytes())
     head, end, body = Path(os.environ[TRUTH]).read_bytes().partition(b"end_header\n")
+    if not head:
+        raise SystemExit("nothing to copy")
     seen = f"comment images {images.hexdigest()}, scheduler {os.environ.get('ORTHOCAPTURE_SCHEDULER')}\n"
     mesh.write_bytes(head + seen.encode() + end + body)
 
