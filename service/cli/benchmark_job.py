@@ -128,4 +128,5 @@ def _standing(asked: AskedBenchmark, job: Job) -> str:
     )
     lacks = missing(method)
     where = f" on a machine with {method.expects} (not this one: {lacks})" if lacks else ""
-    return f"waits for a worker{where}; {listening}. One is `orthocapture worker --kinds {KIND.name} --data {data}`"
+    start = "" if here and not lacks else f". Start one: `orthocapture worker --kinds {KIND.name} --data {data}`"
+    return f"waits for a worker{where}; {listening}{start}"

@@ -193,7 +193,7 @@ def test_a_job_that_nobody_waits_for_is_printed_with_what_it_waits_for(site: Ben
         done = CliRunner().invoke(app, [*command, "--data", str(site.data)], catch_exceptions=False)
     printed = " ".join(done.stdout.split())
     assert "waits for a worker on a machine with the file that SHIFTED_TRUTH names (not this one: " in printed
-    assert "none of this folder listens. One is `orthocapture worker --kinds benchmark --data" in printed
+    assert "none of this folder listens. Start one: `orthocapture worker --kinds benchmark --data" in printed
     job = printed.split()[1]
     site.cancel(job)
     assert site.event(JobFailed, job)[1].message == "Erika cancelled it: asked by mistake"
