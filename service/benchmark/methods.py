@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
+from service.benchmark.versions import commit_in, first_line, of_packages
 from service.core.declared_kinds import declared_kinds, kind_named
 from service.core.errors import DataError
 from service.core.geometry import Array
@@ -57,6 +58,8 @@ class Method:
         programs: programs that are looked for on the path.
         variable: the environment variable with the folder of its source code; "" if it needs none.
         lacking: says what else is missing to run it on this machine; "" if nothing is.
+        version: returns what is installed on this machine; "" if it is not known.
+        random: it makes another mesh of the same images each time.
     """
 
     name: str
@@ -69,6 +72,8 @@ class Method:
     programs: tuple[str, ...] = ()
     variable: str = ""
     lacking: Callable[[], str] = lambda: ""
+    version: Callable[[], str] = lambda: ""
+    random: bool = False
 
 
 def methods() -> dict[str, Method]:
@@ -99,6 +104,12 @@ def missing(method: Method, environment: Mapping[str, str] = os.environ) -> str:
     if method.variable and not Path(environment[method.variable]).is_dir():
         return f"{method.variable} names no folder"
     return method.lacking()
+
+
+def lacking_here(name: str) -> str:
+    """Describe what is missing to run the method of this name on this machine; "" if it can be run."""
+    known = methods()
+    return missing(known[name]) if name in known else f"there is no method {name!r}"
 
 
 def place_of(method: Method, folder: Path, environment: Mapping[str, str] = os.environ) -> Workplace:
@@ -198,11 +209,12 @@ def _gsplat_commands(place: Workplace) -> tuple[Command, ...]:
 
 
 def _gsplat_lacking() -> str:
-    """Packages are looked for first: torch takes seconds to load."""
+    """Packages are looked for first: torch takes seconds to load, and much memory: so not in this process."""
     lacks = [name for name in ("torch", "gsplat") if importlib.util.find_spec(name) is None]
     if lacks:
         return f"{', '.join(lacks)} not installed"
-    return "" if importlib.import_module("torch").cuda.is_available() else "torch finds no CUDA GPU"
+    asked = first_line(sys.executable, "-c", "import torch; print(torch.cuda.is_available())")
+    return "" if asked == "True" else "torch finds no CUDA GPU"
 
 
 def _instant_ngp_commands(place: Workplace) -> tuple[Command, ...]:
@@ -286,6 +298,8 @@ KINDS = (
         at(_MESH),
         programs=("colmap",),
         lacking=_colmap_lacking,
+        version=lambda: first_line("colmap", "-h"),
+        random=True,
     ),
     Method(
         "gsplat",
@@ -295,6 +309,8 @@ KINDS = (
         _gsplat_commands,
         at(_MESH),
         lacking=_gsplat_lacking,
+        version=of_packages("gsplat", "torch"),
+        random=True,
     ),
     Method(
         "instant-ngp",
@@ -305,6 +321,8 @@ KINDS = (
         at(_MESH),
         from_unit_box,
         variable="ORTHOCAPTURE_INSTANT_NGP",
+        version=commit_in("ORTHOCAPTURE_INSTANT_NGP"),
+        random=True,
     ),
     Method(
         "neus2",
@@ -315,6 +333,8 @@ KINDS = (
         at(f"output/{_NEUS2_NAME}/mesh/{_NEUS2_STEPS}.obj"),  # relative to the folder that it is run in
         from_unit_box,
         variable="ORTHOCAPTURE_NEUS2",
+        version=commit_in("ORTHOCAPTURE_NEUS2"),
+        random=True,
     ),
     # Depth maps, a Delaunay mesh, refined against the images.
     Method(
@@ -325,6 +345,7 @@ KINDS = (
         _openmvs_commands,
         at(_OPENMVS_MESH),
         programs=("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh"),
+        random=True,
     ),
     # For machines without the program `colmap`.
     Method(
@@ -335,9 +356,19 @@ KINDS = (
         _pycolmap_commands,
         at(_MESH),
         lacking=_pycolmap_lacking,
+        version=of_packages("pycolmap", "pycolmap-cuda12"),
+        random=True,
     ),
     # Our own: semi-global matching of rectified pairs, fused in a distance field; it needs no GPU.
-    Method("stereo", "Stereo (CPU)", "nothing else", "colmap-pinhole", _stereo_commands, at(_MESH)),
+    Method(
+        "stereo",
+        "Stereo (CPU)",
+        "nothing else",
+        "colmap-pinhole",
+        _stereo_commands,
+        at(_MESH),
+        version=of_packages("orthocapture"),
+    ),
     # Gaussians aligned with the surface, and a mesh of them.
     Method(
         "sugar",
@@ -347,5 +378,7 @@ KINDS = (
         _sugar_commands,
         newest("sugar/**/sugarfine_*.obj"),
         variable="ORTHOCAPTURE_SUGAR",
+        version=commit_in("ORTHOCAPTURE_SUGAR"),
+        random=True,
     ),
 )

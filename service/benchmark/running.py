@@ -8,7 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,15 +19,17 @@ import psutil
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import Command, Method, Workplace, missing, place_of
 from service.benchmark.programs import measured
-from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Scenario, Score
+from service.benchmark.records import RESULT
 from service.benchmark.scoring import score_mesh, write_scored
+from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Scenario, Score
 from service.compute.ground_truth.chamfer import ChamferSettings
 from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
 from service.dataset.exported import scaled_data_set
 from service.dataset.exporter import exporter, write_data_set
-from service.dataset.records import DataSet
+from service.dataset.records import DataSet, Mesh
+from service.machine.executors import VARIABLE
 from service.machine.resources import processor_model
 from service.store.artefacts import hash_file
 from service.store.durable_effects import DurableFiles
@@ -36,7 +38,9 @@ _LAST_LINES = 12  # of a failed program's output, for the message
 _ANSWER_S = 10.0  # that the NVIDIA driver may take to name its GPU
 
 
-def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> ComputingEffort:
+def run_commands(
+    commands: tuple[Command, ...], work: Path, log: Path, environment: Mapping[str, str] = os.environ
+) -> ComputingEffort:
     """Run commands one after the other in a folder, with their output in a file.
 
     Raises:
@@ -46,7 +50,7 @@ def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Comput
     wall_s = cpu_s = peak_bytes = 0.0
     log.write_bytes(b"")
     for command in commands:
-        took = _measured(command, work, log)
+        took = _measured(command, work, log, environment)
         wall_s += took["wall_s"]
         cpu_s += took["cpu_s"]
         peak_bytes = max(peak_bytes, took["peak_bytes"])
@@ -62,7 +66,7 @@ def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Comput
     )
 
 
-def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
+def _measured(command: Command, work: Path, log: Path, environment: Mapping[str, str]) -> dict[str, Any]:
     """Run a command, and return its status and what it took, as `programs/measured.py` says it."""
     reading, writing = os.pipe()
     with log.open("ab") as output, os.fdopen(reading, "rb") as said:
@@ -71,7 +75,8 @@ def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
         try:
             process = subprocess.Popen(
                 [sys.executable, "-I", "-S", measured.__file__, str(writing), *command],
-                cwd=work, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, pass_fds=(writing,),
+                cwd=work, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                pass_fds=(writing,),
             )  # fmt: skip
         finally:
             os.close(writing)
@@ -110,6 +115,7 @@ def _gpu() -> str:
 
 
 _IDENTITY = "identity.txt"
+OUTPUT = "output.txt"  # of the method's commands
 Progress = Callable[[str, int, int], None]
 
 
@@ -124,6 +130,7 @@ class Trial:
         mesh: a mesh made elsewhere, as the method writes it; None to run the method here.
         width: the images' width in pixels; 0 for that of the data set.
         settings: the settings of the comparison.
+        here_alone: the commands do not see the cluster that the environment names.
     """
 
     method: Method
@@ -132,6 +139,7 @@ class Trial:
     mesh: Path | None = None
     width: int = 0
     settings: ChamferSettings = field(default_factory=ChamferSettings)
+    here_alone: bool = False
 
     @property
     def folder(self) -> Path:
@@ -167,10 +175,7 @@ def run_trial(
     _export(trial, dataset, place.data)
     commands = trial.method.commands(place)
     mesh, effort, failure = _mesh(trial, place, commands, progress)
-    truth = truth_file(trial.out, whole.identity)
-    if not truth.is_file():
-        comments = list(filter(None, ("world frame, metres", whole.mark)))
-        write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, comments)
+    write_truth(trial.out, whole.identity, whole.mesh, whole.mark)
     score, sha256, faces = _scored(trial, mesh, dataset, progress) if mesh is not None else (None, "", 0)
     result = BenchmarkResult(
         method=trial.method.name,
@@ -189,9 +194,19 @@ def run_trial(
         failure=failure,
         machine=this_machine(),
         finished_utc=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        version="" if effort is None else trial.method.version(),
+        random=trial.method.random,
     )
-    _keep(trial.folder / RESULT, result)
+    write_result(trial.folder, result)
     return result
+
+
+def write_truth(out: Path, dataset_sha256: str, mesh: Mesh, mark: str) -> None:
+    """Write a data set's ground truth beside the results, unless it is there."""
+    truth = truth_file(out, dataset_sha256)
+    if not truth.is_file():
+        comments = list(filter(None, ("world frame, metres", mark)))
+        write_ply(truth, Surface(mesh.vertices_m, mesh.faces), 1.0, {}, comments)
 
 
 def truth_file(out: Path, dataset_sha256: str) -> Path:
@@ -243,7 +258,9 @@ def _run(trial: Trial, place: Workplace, commands: tuple[Command, ...]) -> tuple
     if place.work.exists():
         shutil.rmtree(place.work)
     place.work.mkdir()
-    effort = run_commands(commands, place.work, trial.folder / "output.txt")
+    cluster = VARIABLE if trial.here_alone else ""
+    environment = {name: value for name, value in os.environ.items() if name != cluster}
+    effort = run_commands(commands, place.work, trial.folder / OUTPUT, environment)
     return effort, trial.method.mesh(place)
 
 
@@ -260,7 +277,9 @@ def _scored(trial: Trial, mesh: Path, dataset: DataSet, progress: Progress) -> t
     return scored.score, hash_file(mesh)[0], len(file.faces)
 
 
-def _keep(path: Path, result: BenchmarkResult) -> None:
+def write_result(folder: Path, result: BenchmarkResult) -> None:
+    """Write a result into its folder, durably."""
+    path = folder / RESULT
     part = path.with_suffix(".part")
     part.write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
     DurableFiles().sync_file(part)

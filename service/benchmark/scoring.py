@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from service.benchmark.records import Score
+from service.computations.benchmark import Score
 from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.fuse import compact
 from service.compute.ground_truth.heat_map import HeatScale, heat_picture
@@ -22,6 +22,7 @@ from service.dataset.records import DataSet, Mesh
 from service.machine.resources import large_arrays_returned
 
 MARGIN_M = 0.002
+SCORED, HEAT_MAP = "mesh.ply", "heat_map.png"  # what is written of a scored mesh
 _POINTS = 200_000  # of the truth, by which its box is found
 
 
@@ -112,9 +113,9 @@ def write_scored(scored: Scored, dataset: DataSet, folder: Path, settings: Chamf
     Both say so if the data set is simulated.
     """
     comments = ["world frame, metres; cut to the box of the truth", dataset.mark]
-    write_ply(folder / "mesh.ply", scored.surface, 1.0, {}, list(filter(None, comments)))
+    write_ply(folder / SCORED, scored.surface, 1.0, {}, list(filter(None, comments)))
     scale = HeatScale.of(scored.chamfer, (settings or ChamferSettings()).outlier_m)
     truth = Surface(dataset.mesh.vertices_m, dataset.mesh.faces)
     names = ("prediction", "simulated truth" if dataset.simulated else "truth")
     picture = heat_picture(scored.surface, truth, scored.chamfer, scale, names)
-    (folder / "heat_map.png").write_bytes(png(picture, dataset.mark))
+    (folder / HEAT_MAP).write_bytes(png(picture, dataset.mark))

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import Method, Workplace, missing
-from service.benchmark.records import SCENARIOS, BenchmarkResult, Scenario
+from service.benchmark.records import SCENARIOS
 from service.benchmark.running import truth_file
+from service.computations.benchmark import BenchmarkResult, Scenario
 from service.compute.ground_truth.chamfer import OUTLIER_M, DistanceSamples, sample
 from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.heat_map import HeatScale, Panel, heat_bar, heat_row

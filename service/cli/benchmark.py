@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
 from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
     JsonOption,
     console,
     print_document,
@@ -21,8 +23,16 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
+from service.cli.options import OperatorOption, PasswordOption, acting_person
+from service.core.errors import ConfigurationError
 from service.core.units import metres
 from service.machine.executors import computing_as_environment_says
+from service.store.store import Store
+
+if TYPE_CHECKING:
+    from service.benchmark.methods import Method
+    from service.benchmark.recorded import WantedBenchmark
+    from service.computations.benchmark import BenchmarkResult
 
 DEFAULT_OUT = Path("benchmark")
 
@@ -33,7 +43,14 @@ class _Scenario(StrEnum):
 
 
 def run_command(
-    dataset: Annotated[Path, typer.Argument(help="Folder written by `orthocapture export --format hdf5`.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            metavar="DATASET|RUN",
+            help="Folder written by `orthocapture export --format hdf5`; or a run of --data, by its name, its first "
+            "characters, or `latest`: then a worker computes.",
+        ),
+    ],
     method: Annotated[
         str,
         typer.Option(
@@ -53,6 +70,12 @@ def run_command(
     spacing_mm: Annotated[
         float, typer.Option("--spacing-mm", min=0.01, help="Spacing to which both meshes are sampled.")
     ] = 0.1,
+    data: DataOption = DEFAULT_DATA,
+    no_wait: Annotated[
+        bool, typer.Option("--no-wait", help="Of a run: only enqueue the job, and print its number.")
+    ] = False,
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Reconstruct the specimen with a method, and compare its mesh with the ground truth.
@@ -60,7 +83,30 @@ def run_command(
     The method gets images, poses and the extent of the scene in the format that it reads. Its mesh is brought back
     into the frame of the data set, cut to the box of the ground truth, and scored as `evaluate chamfer` does. If the
     method is not installed, the command says what is expected; run it elsewhere and give its mesh with --mesh.
+
+    Of a completed run, the same is computed by a worker of its data folder or site on whose machine the method is
+    installed. Its answer is recorded in the run, and written as that of a folder is. The command waits for it; Ctrl-C
+    leaves the job in the queue.
     """
+    if not _names_folder(dataset):
+        with reporting_errors(json):
+            from service.benchmark.methods import method_named  # noqa: PLC0415
+            from service.benchmark.recorded import WantedBenchmark  # noqa: PLC0415
+
+            how = method_named(method)
+            if mesh is not None:
+                raise ConfigurationError(
+                    "a mesh made elsewhere is scored on an exported data set",
+                    where="--mesh",
+                    remedy="Export the run with --format hdf5, and name that folder in the place of the run",
+                )
+            wanted = WantedBenchmark(how.name, scenario.value, width, metres(spacing_mm))
+            with Store.open(data, create=False) as store:
+                run_id = store.find_run(dataset)
+                require_writable_folder(out)
+                who = acting_person(store, operator, "export", password_stdin=password_stdin)
+                _run_of_site(store, run_id, how, wanted, who.name, None if no_wait else out, json=json)
+        return
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         # These load the numerics, which take seconds.
         from service.benchmark.methods import method_named  # noqa: PLC0415
@@ -69,25 +115,62 @@ def run_command(
         from service.dataset.exported import data_set_of_folder  # noqa: PLC0415
 
         how = method_named(method)
+        if no_wait:
+            raise ConfigurationError("only the job of a run can be left to a worker", where="--no-wait")
         require_writable_folder(out)
         progress("reading the data set", 0, 0)
-        whole = data_set_of_folder(dataset)
+        whole = data_set_of_folder(Path(dataset))
         trial = Trial(how, scenario.value, out, mesh, width, ChamferSettings(metres(spacing_mm)))
         with computing_as_environment_says():
             result = run_trial(trial, whole, progress)
+    _print_result(result, how, trial.folder, json=json)
+
+
+def _names_folder(dataset: str) -> bool:
+    """Return whether an exported folder is meant: there is one, or it is written as a path."""
+    return Path(dataset).is_dir() or len(Path(dataset).parts) > 1
+
+
+def _run_of_site(
+    store: Store, run_id: str, how: Method, wanted: WantedBenchmark, actor: str, out: Path | None, *, json: bool
+) -> None:
+    """Enqueue a benchmark and, with `out`, wait for its answer, write it there and print it."""
+    from service.cli.benchmark_job import (  # noqa: PLC0415 - it loads the numerics, which takes seconds
+        ask_for_benchmark,
+        report_left,
+        wait_for_benchmark,
+        written_answer,
+    )
+
+    asked = ask_for_benchmark(store, run_id, how, wanted, actor=actor)
+    result = None
+    if out is not None:
+        with progress_bar(quiet=json) as progress:
+            answered = wait_for_benchmark(asked, progress, quiet=json)
+            result = None if answered is None else written_answer(asked, answered, out, progress)
+    if result is not None and out is not None:
+        _print_result(result, how, out / f"{result.method}-{result.scenario}", json=json)
+    elif json:
+        print_json({"run": run_id, "job": asked.job.job_id})
+    else:
+        report_left(asked)
+
+
+def _print_result(result: BenchmarkResult, how: Method, folder: Path, *, json: bool) -> None:
+    """Print a result: distances in a sentence, or why there is no mesh."""
     if json:
         print_json(result.model_dump(mode="json"))
     elif result.score is None:
-        console.print(f"{how.words}, {scenario.value}: no mesh. {result.failure}")
+        console.print(f"{how.words}, {result.scenario}: no mesh. {result.failure}")
     else:
         score = result.score
         console.tell(
-            f"{how.words}, {scenario.value}, {result.views} images: ",
+            f"{how.words}, {result.scenario}, {result.views} images: ",
             (f"Chamfer distance {score.chamfer_mm:.3f} mm", "bold"),
             f" (accuracy {score.accuracy_mm:.3f} mm, "
             f"completeness {score.completeness_mm:.3f} mm; equal surfaces would give {score.floor_mm:.3f} mm)",
         )
-        console.print(f"  written: {trial.folder!s}")
+        console.print(f"  written: {folder!s}")
 
 
 def table_command(

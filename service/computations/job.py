@@ -5,14 +5,15 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from service.computations.kind import Demand, JobKind, JobRecord, NoAnswer
-from service.core.records.events import ArtefactRef
+from service.core.errors import IntegrityError
+from service.core.records.events import ArtefactRef, Event
 
 A = TypeVar("A")
 
@@ -50,11 +51,16 @@ class JobAnswer:
         return self.answer.plain()
 
 
+def _no_record(run_id: str) -> Sequence[Event]:
+    raise IntegrityError("this job was given no record to read", where=run_id)
+
+
 @dataclass(frozen=True, slots=True)
 class JobContext(Generic[A]):
     """A job's surroundings: its arguments, verified inputs, a scratch folder and the store for its outputs.
 
-    `begin` surrounds the computation: a worker waits there until the machine has what the job demands.
+    `begin` surrounds the computation: a worker waits there until the machine has what the job demands. `events`
+    returns the events of the job's run, for the few kinds that need the whole record.
     """
 
     arguments: A
@@ -62,6 +68,7 @@ class JobContext(Generic[A]):
     scratch: Path
     progress: Callable[[str, int, int], None]
     begin: Callable[[Demand], AbstractContextManager[None]] = lambda _demand: nullcontext()
+    events: Callable[[str], Sequence[Event]] = _no_record
 
     def input(self, sha256: str) -> Path:
         """Return an artefact's file after its hash was verified."""

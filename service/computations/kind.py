@@ -40,15 +40,21 @@ class Demand:
     Attributes:
         memory_mb: the most that it and the processes that it starts need together.
         limit_s: the time after which it is ended: many times what it takes on a slow machine.
+        alone: true if no other such job is computed beside it on its machine, because its seconds are a result.
     """
 
     memory_mb: float
     limit_s: float
+    alone: bool = False
 
 
 def usual_demand(_arguments: JobRecord) -> Demand:
     """Return the demand of a kind that declares none, such as one of a plug-in."""
     return Demand(memory_mb=1000, limit_s=7200)
+
+
+def _nothing(_record: JobRecord) -> str:
+    return ""
 
 
 _NO_JOBS: Jobs = {}
@@ -76,6 +82,12 @@ class JobKind(Generic[A, R]):
         aside: true if the provenance drawing omits it, because no result depends on it.
         demand: returns what a job with these arguments takes: measured for surfaces
             (bench/results/job_memory-*.json), estimated for images.
+        needs: names what a machine must have to compute a job with these arguments, such as a program.
+        lacking: `module:function`, imported when such a job waits in the queue. The function takes a name that
+            `needs` gives, and says what of it is missing on this machine, where the job is then left to others; ""
+            if nothing is. "" instead of a function: every machine can compute this kind.
+        circumstances: the fields of the answer that say how it was computed, not what: a replay compares the others.
+        unrepeatable: says why a replay has nothing to compare a recorded answer with; "" if it has.
     """
 
     name: str
@@ -88,6 +100,10 @@ class JobKind(Generic[A, R]):
     replayed: bool = True
     aside: bool = False
     demand: Callable[[A], Demand] = usual_demand
+    needs: Callable[[A], str] = _nothing
+    lacking: str = ""
+    circumstances: tuple[str, ...] = ()
+    unrepeatable: Callable[[R], str] = _nothing
 
     def other_numbers(self, recorded_version: int) -> str:
         """Say that another version computed a recorded job, with other numbers or fewer; "" if this one did."""
@@ -97,6 +113,10 @@ class JobKind(Generic[A, R]):
             f"computed by version {recorded_version} of the {self.words}; this program has version {self.version}, "
             "whose numbers differ or are more"
         )
+
+    def not_compared(self, recorded: Mapping[str, Any]) -> str:
+        """Say why a replay has nothing to compare this recorded answer with; "" if it has. Raises IntegrityError."""
+        return "" if self.unrepeatable is _nothing else self.unrepeatable(self.read_answer(recorded))
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:
         """Return the arguments of a recorded job of any version. Raises IntegrityError."""

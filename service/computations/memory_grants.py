@@ -29,6 +29,7 @@ from service.store.runs import ProcessIdentity
 
 _RESERVE_MB = 400.0  # for what else runs on the machine
 _POLL_S = 0.5
+ALONE = "waits until another one has ended: the seconds of each are measured"
 _log = logging.getLogger(__name__)
 
 
@@ -41,6 +42,7 @@ class Grant(Record):
     process_started_s: float
     job: str
     memory_mb: float
+    alone: bool = False  # beside no other such job
     waits: str = ""  # the reason, as a phrase; "" for one that has been granted
     place: int = 0  # the place in the queue of those that wait
 
@@ -68,13 +70,16 @@ class MemoryGrants:
     patience_s: float = 600.0
 
     @contextmanager
-    def granted(self, job: str, memory_mb: float, tell: Callable[[str], None]) -> Generator[None]:
+    def granted(
+        self, job: str, memory_mb: float, tell: Callable[[str], None], *, alone: bool = False
+    ) -> Generator[None]:
         """Wait until a job fits beside what runs; within the block its memory is granted.
 
         Args:
             job: the job's id.
             memory_mb: the most that it needs, with what this process has already.
             tell: called with the reason of the wait, whenever that changes.
+            alone: true to wait also until no other job that is to be alone is computed on this machine.
 
         Raises:
             ComputeError: the machine does not have that much, or other programs have occupied it for long.
@@ -95,6 +100,7 @@ class MemoryGrants:
             process_started_s=_here().process_started_s,
             job=job,
             memory_mb=memory_mb,
+            alone=alone,
         )
         told, since_s = "", self.clock.monotonic_s()
         try:
@@ -137,6 +143,8 @@ class MemoryGrants:
         """Return why a job cannot start beside the others; "" if it can."""
         used_mb = {grant.pid: _used_mb(grant.pid) for grant in (wanted, *others)}
         granted = [other for other in others if not other.waits]
+        if wanted.alone and any(other.alone for other in granted):
+            return ALONE
         free_mb = self.memory().available_mb - _RESERVE_MB
         free_after_them_mb = free_mb + sum(used_mb[other.pid] for other in granted)
         free_mb -= sum(max(0.0, other.memory_mb - used_mb[other.pid]) for other in granted)
@@ -144,7 +152,7 @@ class MemoryGrants:
         if needed_mb > free_mb:
             return f"waits for memory: it needs {_rounded(needed_mb)} MB, {_rounded(free_mb)} MB are free"
         for other in others:
-            earlier = bool(other.waits) and (not wanted.place or other.place < wanted.place)
+            earlier = bool(other.waits) and other.waits != ALONE and (not wanted.place or other.place < wanted.place)
             if earlier and other.memory_mb - used_mb[other.pid] <= free_after_them_mb:
                 return f"waits for memory: one that needs {_rounded(other.memory_mb)} MB has waited longer"
         return ""
@@ -153,6 +161,11 @@ class MemoryGrants:
 def waiting_for_memory(data: Path) -> dict[str, str]:
     """Return why each job on this machine that waits for memory does so, as text by the job's id."""
     return {grant.job: grant.waits for grant in _grants(data) if grant.waits}
+
+
+def computes_alone(data: Path) -> bool:
+    """Return whether a job that is to be alone is computed on this machine."""
+    return any(grant.alone and not grant.waits for grant in _grants(data))
 
 
 def _grants(data: Path) -> Iterator[Grant]:

@@ -82,6 +82,40 @@ class StoredPixels:
             raise DataError(f"{name} cannot be read: {error}", where=view.name, remedy=_REMEDY) from error
 
 
+def lossless_data_set(dataset: DataSet) -> DataSet:
+    """Return the data set of a run as `data_set_of_folder` reads it from its export: with pictures without loss.
+
+    So whoever computes from either computes the same.
+    """
+    views = tuple(dataclasses.replace(view, suffix=".png", taken="") for view in dataset.views)
+    return dataclasses.replace(dataset, views=views, pixels=_Lossless(dataset))
+
+
+class _Lossless:
+    """The views of a data set with their pictures as PNG, in the place of the camera's own files."""
+
+    def __init__(self, photographed: DataSet) -> None:
+        self._inner, self._mark = photographed.pixels, photographed.mark
+
+    def picture(self, view: PosedView) -> bytes:
+        return png(self.colours(view), self._mark)
+
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
+        return self._inner.colours(view)
+
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
+        return self._inner.depth_m(view)
+
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
+        return self._inner.normal(view)
+
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
+        return self._inner.valid(view)
+
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
+        return self._inner.markers(view)
+
+
 def scaled_data_set(dataset: DataSet, width: int) -> DataSet:
     """Return the data set with pictures, depth and masks reduced to this width in pixels.
 

@@ -192,12 +192,13 @@ _log = logging.getLogger(__name__)
 
 
 class WorkerSign(Record):
-    """A worker's report on itself."""
+    """A worker's report on itself; `kinds` are those of the jobs that it was started for, empty: all."""
 
     host: str
     pid: int
     at_utc_s: float
     jobs_done: int
+    kinds: tuple[str, ...] = ()
 
     def lives(self, now_utc_s: float) -> bool:
         """Return whether the worker has reported lately, by now, and is not known to be dead."""
@@ -209,8 +210,8 @@ class WorkerSign(Record):
 class SignOfLife:
     """This process's file. A failure to write is logged and disturbs no computation."""
 
-    def __init__(self, data: Path, clock: Clock) -> None:
-        self._clock = clock
+    def __init__(self, data: Path, clock: Clock, kinds: tuple[str, ...] = ()) -> None:
+        self._clock, self._kinds = clock, kinds
         self._path = _folder(data) / f"{socket.gethostname()}-{os.getpid()}.json"
         self._due_s = 0.0
 
@@ -221,7 +222,8 @@ class SignOfLife:
             return
         self._due_s = now_s + _EVERY_S
         now_utc_s = self._clock.utc_s()
-        sign = WorkerSign(host=socket.gethostname(), pid=os.getpid(), at_utc_s=now_utc_s, jobs_done=jobs_done)
+        host, pid = socket.gethostname(), os.getpid()
+        sign = WorkerSign(host=host, pid=pid, at_utc_s=now_utc_s, jobs_done=jobs_done, kinds=self._kinds)
         part = self._path.with_suffix(".part")
         try:
             part.parent.mkdir(parents=True, exist_ok=True)

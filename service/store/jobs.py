@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
@@ -18,7 +18,7 @@ from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.events import append, canonical, parse_canonical
 from service.store.moved import moved_runs
-from service.store.records import Job, LeaseLostError, NewJob
+from service.store.records import EVERY_JOB, Able, Job, LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity, identity_of, identity_values
 
 ACTOR = "store"  # actor of events about a worker that is gone
@@ -88,10 +88,18 @@ def read_jobs(connection: Connection, run_id: str) -> list[Job]:
 
 
 def open_jobs(
-    connection: Connection, run_id: str | None, lane: Lane | None, kinds: Collection[str] | None = None
+    connection: Connection,
+    run_id: str | None,
+    lane: Lane | None,
+    kinds: Collection[str] | None = None,
+    able: Able = EVERY_JOB,
 ) -> int:
-    """Return the number of jobs queued or being computed, of one run or all, in one lane or both, of some kinds."""
-    statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
+    """Return the number of jobs queued or being computed, of one run or all, in one lane or both, of some kinds.
+
+    With `able`, those that this machine cannot compute are not counted.
+    """
+    statement = select(jobs.c.kind, func.count().label("open"))
+    statement = statement.where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
     if run_id is not None:
         statement = statement.where(jobs.c.run_id == run_id)
     if kinds is not None:
@@ -99,7 +107,16 @@ def open_jobs(
     elsewhere = moved_runs(connection)
     if elsewhere:
         statement = statement.where(jobs.c.run_id.not_in(elsewhere))
-    return connection.execute(statement).scalar_one()
+    counts = {row.kind: row.open for row in connection.execute(statement.group_by(jobs.c.kind))}
+    judged = able.keys() & counts.keys()
+    if judged:
+        rows = connection.execute(
+            statement.with_only_columns(jobs.c.kind, jobs.c.arguments).where(jobs.c.kind.in_(judged))
+        )
+        counts |= dict.fromkeys(judged, 0)
+        for row in rows:
+            counts[row.kind] += able[row.kind](parse_canonical(row.arguments))
+    return sum(counts.values())
 
 
 def started(connection: Connection, clock: Clock, run_id: str) -> dict[str, str]:
@@ -117,6 +134,7 @@ class JobChoice:
     kinds: Collection[str] | None
     run_id: str | None
     lane: Lane | None
+    able: Able = field(default_factory=dict[str, Any])
 
     def condition(self) -> ColumnElement[bool]:
         """Return the choice as a condition on the rows of `jobs`."""
@@ -125,6 +143,11 @@ class JobChoice:
             true() if self.kinds is None else jobs.c.kind.in_(tuple(self.kinds)),
             true() if self.run_id is None else jobs.c.run_id == self.run_id,
         )
+
+    def allows(self, row: Row[Any]) -> bool:
+        """Return whether the machine can compute a job that meets the condition."""
+        able = self.able.get(row.kind)
+        return able is None or able(parse_canonical(row.arguments))
 
 
 def claim(
@@ -141,7 +164,7 @@ def claim(
     here = jobs.c.run_id.not_in(elsewhere) if elsewhere else true()
     ordered = select(jobs).where(unfinished, here, choice.condition()).order_by(jobs.c.priority, jobs.c.position)
     for row in connection.execute(ordered).all():
-        if row.state == "running" and not _take_over(connection, clock, row):
+        if not choice.allows(row) or (row.state == "running" and not _take_over(connection, clock, row)):
             continue
         connection.execute(
             update(jobs)

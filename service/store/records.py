@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -93,6 +93,12 @@ class NewJob:
     try_limit: int = 3
     priority: int = WAITED
     version: int = 1  # version of the arguments' format
+
+
+# Says by kind whether a machine can compute a job with these arguments; kinds that are not in it, every machine can.
+# It is asked within a transaction, and so must not take long.
+Able = Mapping[str, Callable[[Mapping[str, Any]], bool]]
+EVERY_JOB: Able = {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,9 @@ from service.store.events import append, read_events, to_event
 from service.store.mounts import require_own_mount
 from service.store.objects.reading import SpoolReader
 from service.store.records import (
+    EVERY_JOB,
     SITE,
+    Able,
     Artefact,
     Checkpoint,
     Job,
@@ -356,21 +358,31 @@ class Store:
             self._require_run(connection, run_id)
             return queue.read_jobs(connection, run_id)
 
+    def job_with_key(self, run_id: str, idempotency_key: str) -> Job | None:
+        """Return the job of a run that was enqueued with this key, or None."""
+        with self._database.reading() as connection:
+            return queue.find_by_key(connection, run_id, idempotency_key)
+
     def jobs_started(self, run_id: str) -> dict[str, str]:
         """Start time (UTC) of each job of a run that is being computed, by the job's name."""
         with self._database.reading() as connection:
             return queue.started(connection, self.clock, run_id)
 
     def open_jobs(
-        self, run_id: str | None = None, *, lane: Lane | None = None, kinds: Collection[str] | None = None
+        self,
+        run_id: str | None = None,
+        *,
+        lane: Lane | None = None,
+        kinds: Collection[str] | None = None,
+        able: Able = EVERY_JOB,
     ) -> int:
         """Return the number of jobs of a run, or of all runs, that are queued or being computed.
 
         `lane` counts only jobs that a person or a step waits for ("waited"), or only the others ("background");
-        `kinds` only those of these kinds.
+        `kinds` only those of these kinds; `able` leaves out those that this machine cannot compute.
         """
         with self._database.reading() as connection:
-            return queue.open_jobs(connection, run_id, lane, kinds)
+            return queue.open_jobs(connection, run_id, lane, kinds, able)
 
     def claim_job(
         self,
@@ -380,14 +392,15 @@ class Store:
         *,
         run_id: str | None = None,
         lane: Lane | None = None,
+        able: Able = EVERY_JOB,
     ) -> Job | None:
         """Claim the first open job by priority, then age, for `lease_s` seconds; None if there is none.
 
         `kinds`, `run_id` and `lane` restrict the choice: `lane` to jobs that a person or a step waits for ("waited"),
-        or to the others ("background").
+        or to the others ("background"), `able` to those that this machine can compute.
         """
         with self._database.writing() as connection:
-            choice = queue.JobChoice(kinds, run_id, lane)
+            choice = queue.JobChoice(kinds, run_id, lane, able)
             return queue.claim(connection, self._clock, self._ids, worker=worker, lease_s=lease_s, choice=choice)
 
     def renew_job(self, job: Job, lease_s: float) -> Job:

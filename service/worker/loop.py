@@ -28,6 +28,7 @@ from service.machine.executors import Place, noting_places
 from service.machine.resources import processor_model
 from service.store.records import Job, LeaseLostError
 from service.store.store import Store
+from service.worker.abilities import Abilities
 
 if TYPE_CHECKING:
     from service.worker.following import FollowedRuns
@@ -72,14 +73,18 @@ def work(
     following: FollowedRuns | None = None
     done = 0
     waiting = False
+    abilities = Abilities(store.database_path.parent, store.clock)
     with closing(store.changes("jobs")) as changes:
         while not stop():
             waiting = _disk_full(store, told=waiting)
             if waiting:
                 store.clock.sleep(_POLL_S)
                 continue
-            job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS if kinds is None else kinds), lane=lane)
+            wanted = list(HANDLERS if kinds is None else kinds)
+            job = store.claim_job(name, _LEASE_S, kinds=wanted, lane=lane, able=abilities.able_now)
             if job is None:
+                if abilities.look():
+                    continue
                 if until_idle:
                     return done
                 changes.wait(_POLL_S)
@@ -120,7 +125,11 @@ def _do(
 
     @contextmanager
     def begin(demand: Demand) -> Generator[None]:
-        with grants.granted(job.job_id, demand.memory_mb, lambda why: progress(f"{term(job.kind)} {why}", 0, 0)):
+
+        def report(why: str) -> None:
+            progress(f"{term(job.kind)} {why}", 0, 0)
+
+        with grants.granted(job.job_id, demand.memory_mb, report, alone=demand.alone):
             attempt.limit(demand.limit_s)
             progress(term(job.kind), 0, 0)
             yield
@@ -128,7 +137,7 @@ def _do(
     progress(term(job.kind), 0, 0)
     with noting_places() as places, attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
         arguments = following.resolved(job)
-        answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress, begin))
+        answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress, begin, store.events))
     if attempt.over:
         return
     try:

@@ -29,6 +29,7 @@ from service.machine.executors import computing_at
 from service.machine.resources import compute_in_background, keep_freed_memory
 from service.monitor.snapshot import SignOfLife
 from service.store.store import Store
+from service.worker.abilities import Abilities
 from service.worker.loop import work
 
 if TYPE_CHECKING:
@@ -173,16 +174,22 @@ def work_side_by_side(
         the number of jobs computed.
     """
     with Store.open(data) as store:
-        if until_idle and not store.open_jobs(kinds=kinds):
+        abilities = Abilities(data, store.clock)
+
+        def idle() -> bool:
+            """Say whether no job is left that this machine can compute."""
+            return not store.open_jobs(kinds=kinds, able=abilities.able) and not abilities.look()
+
+        if until_idle and idle():
             return 0
         with (
             Pool(store, data, at_once, scheduler, kinds) as pool,
-            contextlib.closing(SignOfLife(data, store.clock)) as sign,
+            contextlib.closing(SignOfLife(data, store.clock, kinds or ())) as sign,
         ):
             while not stop():
                 pool.tend(progress)
                 sign.give(pool.done)
-                if until_idle and not store.open_jobs(kinds=kinds):
+                if until_idle and idle():
                     while pool.tend(progress) or pool.busy:  # a job's end is recorded before its child reports it
                         pass
                     break

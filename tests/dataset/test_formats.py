@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import cv2
@@ -153,6 +154,25 @@ def test_the_ten_lines_of_the_documents_project_the_mesh_onto_the_image(dataset:
     shift_px = np.linalg.lstsq(slopes[smooth], off[smooth], rcond=None)[0]
     assert np.count_nonzero(smooth) > 300
     assert np.abs(shift_px).max() < 0.5
+
+
+def test_hdf5_is_the_same_while_a_profiler_holds_what_the_writer_has_left(dataset: DataSet, tmp_path: Path) -> None:
+    """A Dask worker's profiler holds frames, and so their arrays, for a moment; this one holds them to the end."""
+    alone, watched = tmp_path / "alone", tmp_path / "watched"
+    alone.mkdir()
+    watched.mkdir()
+    hdf5 = written(dataset, "hdf5", alone)
+    held: list[FrameType] = []
+    before = sys.getprofile()
+    sys.setprofile(lambda frame, _event, _argument: held.append(frame))
+    try:
+        again = written(dataset, "hdf5", watched)
+    finally:
+        sys.setprofile(before)
+    files = list(hdf5.rglob("*.h5"))
+    assert len(files) == len(dataset.views) + 1
+    for file in files:
+        assert (again / file.relative_to(hdf5)).read_bytes() == file.read_bytes(), file.name
 
 
 def test_hdf5_holds_image_depth_and_pose(dataset: DataSet, tmp_path: Path) -> None:

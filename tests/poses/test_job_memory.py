@@ -7,22 +7,21 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
-import psutil
 import pytest
 
 from service.computations import job_kinds
 from service.computations.job import JobAnswer, RecordedContext
 from service.computations.kind import Demand
-from service.computations.memory_grants import Grant, MemoryGrants, waiting_for_memory
+from service.computations.memory_grants import ALONE, Grant, MemoryGrants, waiting_for_memory
 from service.core.errors import ComputeError, IllegalTransitionError
 from service.core.records.events import JobFailed
 from service.machine.resources import MachineMemory, machine_memory, processes_for
 from service.store.records import LeaseLostError, NewJob
-from service.store.runs import ProcessIdentity
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker import loop
 from service.worker.loop import work
+from tests.support.record.grants import write_grant
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, enqueue, start_run
 
@@ -112,28 +111,6 @@ def test_a_job_waits_until_it_fits_beside_those_of_all_workers_and_says_so(store
     assert len(told) == 1
     assert "waits for memory: it needs" in told[0]
     assert not list(folder.glob("*.json"))
-
-
-def write_grant(folder: Path, pid: int, job: str, memory_mb: float, *, waits: str = "", place: int = 0) -> Path:
-    """What another process was granted, or waits for."""
-    here = ProcessIdentity.of_this_process()
-    started_s = here.process_started_s
-    if psutil.pid_exists(pid):
-        started_s = psutil.Process(pid).create_time() - psutil.boot_time()
-    grant = Grant(
-        host=here.host,
-        boot=here.boot,
-        pid=pid,
-        process_started_s=started_s,
-        job=job,
-        memory_mb=memory_mb,
-        waits=waits,
-        place=place,
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{here.host}-{pid}.json"
-    path.write_text(grant.model_dump_json(), encoding="utf-8")
-    return path
 
 
 def test_a_small_job_does_not_overtake_a_large_one_that_has_waited_longer(store: Store, clock: SteppedClock) -> None:
@@ -227,6 +204,23 @@ def test_a_job_that_can_never_fit_is_refused_in_words_and_not_tried_again(
     assert end.error == "ComputeError"
     assert "needs 1000000000 MB of memory, and this machine has" in end.message
     assert "on a machine with more memory" in end.message
+
+
+def test_jobs_that_are_to_be_alone_wait_for_each_other_and_for_no_other(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    theirs = write_grant(data / "monitor" / "memory", os.getppid(), "theirs", 100, alone=True)
+    grants = MemoryGrants(data, clock, lambda: LARGE)
+    with grants.granted("another kind", 100, pytest.fail):
+        pass
+    reasons: list[str] = []
+
+    def see(why: str) -> None:
+        reasons.append(why)
+        theirs.unlink()
+
+    with grants.granted("mine", 100, see, alone=True):
+        pass
+    assert reasons == [ALONE]
 
 
 def test_a_full_disk_keeps_no_job_from_being_computed(tmp_path: Path, clock: SteppedClock) -> None:

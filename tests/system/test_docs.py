@@ -157,6 +157,13 @@ RUN_ELSEWHERE = {
         ),
         "tests/benchmark/test_benchmark_command.py::test_methods_are_run_scored_and_put_into_the_table",
     ),
+    **dict.fromkeys(
+        (
+            "orthocapture benchmark run latest --method gsplat --scenario dense --out benchmark --data runs",
+            "orthocapture worker --kinds benchmark --data runs",
+        ),
+        "tests/benchmark/test_benchmark_job.py::test_the_machine_with_the_method_answers_and_the_answer_is_evidence",
+    ),
     "orthocapture layout --spheres spheres.json": "tests/layout/test_layout.py::test_command",
     "orthocapture export latest --format colmap --out dataset --data runs": (
         "tests/dataset/test_export_command.py::test_a_run_is_exported_recorded_and_still_verifies"

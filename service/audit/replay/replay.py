@@ -229,7 +229,7 @@ def _replay_job(
     recomputed: RecomputedJobs,
     progress: Progress,
 ) -> JobReplay:
-    recorded = _finished(run, job)
+    recorded, kind = _finished(run, job), job_kinds()[job.kind]
     about = JobReplay(
         job=job.job,
         kind=job.kind,
@@ -237,12 +237,16 @@ def _replay_job(
         attempt=job.attempt,
         label=str(job.arguments.get("poses", "")),
         verdict="not_replayed",
-        computed_by=job_kinds()[job.kind].other_numbers(_version(run, job)),
+        computed_by=kind.other_numbers(_version(run, job)),
     )
+    why_not = kind.not_compared(recorded.result)
+    if why_not:
+        return replace(about, error=why_not)
     started_s = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
-            answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress))
+            context = JobContext(arguments, store, Path(scratch), progress, events=lambda _run: run.events)
+            answer = HANDLERS[job.kind](context)
         now = _as_recorded(recorded, answer)
     except OrthocaptureError as error:
         return replace(about, error=f"{type(error).__name__}: {error}", duration_s=time.monotonic() - started_s)
@@ -269,7 +273,9 @@ def _compare(
     names = [[ref.original_name for ref in refs] for refs in (recorded.artefacts, answer.artefacts)]
     listed = compare_data(*names, path="files")
     measures = compare_data(recorded.measures, now.measures, path="measures")
-    result = compare_data(recorded.result, now.result, path="result", renamed=renamed)
+    left_out = job_kinds()[about.kind].circumstances
+    results = ({name: value for name, value in of.result.items() if name not in left_out} for of in (recorded, now))
+    result = compare_data(*results, path="result", renamed=renamed)
     parts = [measures, result, listed, *(artefact.content for artefact in artefacts)]
     if about.computed_by:  # an earlier version did not tell what this one tells besides
         parts = [part.of_recorded() for part in parts]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from service.dataset.export_folder import ExportFolder, Part
 from service.dataset.exporter import Exporter
@@ -48,12 +50,12 @@ def _view(path: Path, dataset: DataSet, view: PosedView) -> None:
         }
         for name, image in images.items():
             chunks = (rows, camera.width, *image.shape[2:])
-            file.create_dataset(name, data=image, chunks=chunks, compression="gzip", compression_opts=1)
-        file["K"] = camera.matrix
+            _write_array(file, name, image, chunks=chunks, compression="gzip", compression_opts=1)
+        _write_array(file, "K", camera.matrix)
         terms = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, camera.k4, camera.k5, camera.k6)
-        file["distortion"] = np.array(terms)
-        file["T_world_camera"] = view.T_world_camera
-        file["covariance"] = view.covariance
+        _write_array(file, "distortion", np.array(terms))
+        _write_array(file, "T_world_camera", view.T_world_camera)
+        _write_array(file, "covariance", view.covariance)
         file.attrs["camera"] = view.device
 
 
@@ -63,12 +65,22 @@ def _index(path: Path, dataset: DataSet) -> None:
         for view in dataset.views:
             file[f"views/{view.name}"] = h5py.ExternalLink(f"views/{view.name}.h5", "/")
         for name, split in dataset.splits.named().items():
-            file[f"splits/{name}"] = np.array([view.encode() for view in split], dtype="S")
-        file["mesh/vertices_m"] = dataset.mesh.vertices_m
-        file["mesh/faces"] = dataset.mesh.faces
+            _write_array(file, f"splits/{name}", np.array([view.encode() for view in split], dtype="S"))
+        _write_array(file, "mesh/vertices_m", dataset.mesh.vertices_m)
+        _write_array(file, "mesh/faces", dataset.mesh.faces)
         for name in ("source", "sigma_m"):
             if (values := getattr(dataset.mesh, name)) is not None:
-                file[f"mesh/{name}"] = values
+                _write_array(file, f"mesh/{name}", values)
+
+
+def _write_array(file: h5py.File, name: str, values: NDArray[Any], **layout: Any) -> None:
+    """Write an array and close it at once.
+
+    Where the parts of a file lie is decided when arrays are closed. Left to itself that is when nothing refers to
+    them any more, and a thread that looks at frames for a moment, as the profiler of a Dask worker does, would decide
+    on the bytes of the file.
+    """
+    file.create_dataset(name, data=values, **layout).id.close()
 
 
 def _about(file: h5py.File, dataset: DataSet) -> None:

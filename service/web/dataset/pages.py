@@ -13,10 +13,11 @@ from fastapi import Path as UrlPath
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
 from service.audit.background import ChildProcesses, ChildState
-from service.benchmark.records import SCENARIOS, BenchmarkResult, read_results
-from service.core.errors import DataError
+from service.benchmark.records import SCENARIOS, read_results
+from service.computations.benchmark import KIND, BenchmarkResult
+from service.core.errors import DataError, IntegrityError
 from service.core.gates.release import refuse_data_set
-from service.core.records.events import Event, EvidenceExported
+from service.core.records.events import Event, EvidenceExported, JobFinished
 from service.core.run.state import RunState
 from service.dataset.preview_records import AT_LEAST, FILE_NAME, Preview, ViewPreview, read_preview
 from service.store.durable_effects import Clock
@@ -46,14 +47,19 @@ class Benchmark:
 
 
 def benchmark_of(data: Path, events: Sequence[Event]) -> Benchmark:
-    """Return the results in DIR/benchmark whose data set has the list of checksums that the run has recorded."""
+    """Return the results that jobs of the run have answered, and those in DIR/benchmark of its recorded exports.
+
+    The latter are known by the list of checksums of their data set.
+    """
     exported = {e.payload.sha256 for e in events if isinstance(e.payload, EvidenceExported)}
+    answers = [e.payload for e in events if isinstance(e.payload, JobFinished) and e.payload.job_kind == KIND.name]
     try:
         found = read_results(data / FOLDER) if exported else ()
-    except (DataError, OSError) as error:
+        answered = [KIND.read_answer(answer.result) for answer in answers]
+    except (DataError, IntegrityError, OSError) as error:
         return Benchmark((), (), str(error))
     results = sorted(
-        (result for result in found if result.dataset_sha256 in exported),
+        (*answered, *(result for result in found if result.dataset_sha256 in exported)),
         key=lambda result: (result.method, SCENARIOS.index(result.scenario)),
     )
     scores = {

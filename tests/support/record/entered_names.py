@@ -80,6 +80,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "audit release": ("audit", "release", "--yes"),
     "audit correct": ("audit", "correct", "1", "operator", "Somebody", "--reason", "no reason"),
     "export": ("export", "latest", "--format", "plain", "--out", "made"),
+    "benchmark": ("benchmark", "run", "latest", "--method", "stereo", "--scenario", "dense", "--no-wait"),
     "store gc": ("store", "gc", "--remove", "--min-age-min", "0"),
     "store restore": ("store", "restore", "{site}/backup", "made"),
     "store rebuild": ("store", "rebuild"),

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from drivers.meshes.surface_file import read_surface_file
-from service.benchmark.records import Score
 from service.benchmark.scoring import compare
+from service.computations.benchmark import Score
 from service.compute.ground_truth.fuse import Markers, compact
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import inverse

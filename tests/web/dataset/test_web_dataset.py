@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import read_run
-from service.benchmark.records import BenchmarkResult, ComputingEffort, Machine, Score
+from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
 from service.core.records.events import EvidenceExported
 from service.dataset.preview_records import (
     DecidedRegion,

@@ -15,8 +15,9 @@ from service.audit.export.wanted import ExportRequest, WantedExport, keep_reques
 from service.benchmark.matching import open_matching_data, results_in
 from service.benchmark.matching_results import MethodResult, markdown, read_result, write_result
 from service.benchmark.methods import from_unit_box, methods
-from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Score, read_results
+from service.benchmark.records import RESULT, read_results
 from service.benchmark.table import table_markdown
+from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
 from service.compute.ground_truth.surface import Surface, read_ply, write_ply
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
 from service.core.text.files import parse_json
