@@ -35,7 +35,8 @@ with Store.open(Path(sys.argv[1])) as store:
     for k in range(int(sys.argv[2])):
         data = k.to_bytes(4, "big") * 250_000
         ref = store.put_bytes(data, kind="image", media_type="image/jpeg", original_name=f"v{k}.jpg")
-        store.record(run, [captured(ref, f"v{k}")], actor="Ada")
+        new = NewArtefact(ref, "camera", "capture", 1, f"v{k}", "Ada")
+        store.record(run, [captured(ref, f"v{k}")], actor="camera", artefacts=[new])
     print((time.process_time() - before_s) / int(sys.argv[2]))
 """
 _VERIFY = """
