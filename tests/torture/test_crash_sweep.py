@@ -72,4 +72,4 @@ def test_a_store_that_does_not_sync_its_files_shows(tmp_path: Path) -> None:
     assert status == 1, "sixty losses of power, and nothing was missed"
     faults = [fault for entry in shown["faults"] for fault in entry["faults"]]
     lost = ("content", "missing", "bytes", "the event is not in the journal")  # of whichever file was hit first
-    assert any(words in fault for fault in faults for words in lost), faults
+    assert any(text in fault for fault in faults for text in lost), faults
