@@ -30,6 +30,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.forked import run as run_command
 from tests.support.processes.postgres import OTHER, OWNER, ROLE, Cluster
+from tests.support.processes.waiting import until
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run
 from tests.support.rig.rig import command
@@ -354,6 +355,18 @@ def test_positions_have_no_gaps_after_a_transaction_that_failed(site: Path) -> N
             positions = list(connection.execute(numbered).scalars())
     assert positions == list(range(1, len(positions) + 1))
     assert verify(site).ok
+
+
+def test_a_connection_in_use_when_the_store_is_closed_is_closed_when_it_is_given_back(
+    cluster: Cluster, site: Path
+) -> None:
+    store = Store.open(site)
+    with store.database.reading() as connection:
+        server = connection.execute(text("SELECT pg_backend_pid()")).scalar_one()
+        store.close()
+        assert connection.execute(text("SELECT 1")).scalar_one() == 1
+    sessions = f"SELECT 1 FROM pg_stat_activity WHERE pid = {server}"
+    until(lambda: not cluster.run("postgres", sessions), "its session has not ended")
 
 
 def test_the_tables_are_those_of_the_metadata(cluster: Cluster) -> None:

@@ -26,7 +26,6 @@ from tests.support.record.outsider import rows
 from tests.support.record.store import capture, start_run
 
 pytestmark = [
-    pytest.mark.slow,
     pytest.mark.packages("postgresql"),
     pytest.mark.timeout(300),
     pytest.mark.sqlite("begins a server by itself"),
@@ -79,6 +78,7 @@ def schema(cluster: Cluster, database: str) -> list[list[tuple[object, ...]]]:
     return [sorted(cluster.run(database, query), key=str) for query in CATALOGUE]
 
 
+@pytest.mark.slow
 def test_a_later_version_upgrades_what_an_earlier_one_has_prepared(
     cluster: Cluster, following: NextVersion, tmp_path: Path
 ) -> None:
@@ -177,6 +177,7 @@ def waits(cluster: Cluster, kind: str) -> bool:
     return cluster.run("postgres", asked) == [(1,)]
 
 
+@pytest.mark.slow
 def test_a_write_during_an_upgrade_waits_and_is_then_refused_unless_the_upgrade_was_killed(
     cluster: Cluster, following: NextVersion, tmp_path: Path
 ) -> None:
@@ -214,5 +215,3 @@ def test_a_write_during_an_upgrade_waits_and_is_then_refused_unless_the_upgrade_
         (refusal,) = refusals
         assert f"newer version of orthocapture (its revision {NEXT}" in str(refusal)
     assert cluster.run(database, "SELECT count(*) FROM events WHERE kind = 'step_note'") == [(1,)]
-    ((status, said),) = following.run(("audit", "verify", "all", "--data", site))
-    assert status == 0, said

@@ -13,9 +13,10 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import Connection, Engine, TextClause, create_engine, text
+from sqlalchemy import Connection, Engine, TextClause, create_engine, event, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from service.core.errors import ConfigurationError, StoreError
 from service.store.database import postgres_schema
@@ -36,6 +37,7 @@ _NUMBER = text("SELECT txid_current(), NULL")
 _NUMBER_AND_REVISION = text("SELECT txid_current(), (SELECT version_num FROM alembic_version)")
 LOOK = "Look at the database server: does it run, can this machine reach it, has it room? What was recorded is safe"
 
+LOOK_HERE = "Look at the disk of the data folder: room, cable, permissions. What was recorded is safe"
 HUNG = "Another process has held the database for too long; look for one that hangs"
 
 
@@ -167,8 +169,13 @@ class PostgresDatabase(Database):
         return self._engine
 
     def close(self) -> None:
-        """Close all connections."""
+        """Close all connections; one that a thread still uses as soon as it gives it back."""
+        event.listen(self._engine, "checkin", _close_now)
         self._engine.dispose()
+
+
+def _close_now(_connection: object, record: ConnectionPoolEntry) -> None:
+    record.invalidate()
 
 
 def open_postgres(url: str, files: Files, patience_s: float = PATIENCE_S) -> PostgresDatabase:
@@ -252,6 +259,12 @@ def _store_errors(where: str) -> Generator[None]:
         ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=where, remedy=LOOK) from error
+    except OSError as error:  # of files that are written within a transaction, such as keys
+        raise StoreError(
+            f"the data folder refused: {error.strerror or error}",
+            where=str(error.filename or where),
+            remedy=LOOK_HERE,
+        ) from error
 
 
 def _first_line(error: Any) -> str:

@@ -51,7 +51,7 @@ def prepare(owner_url: str, role: str) -> Prepared:
 
 
 def _require_owner(connection: Connection, where: str) -> None:
-    asked = "SELECT tableowner, current_user FROM pg_tables WHERE tablename = 'alembic_version'"
+    asked = "SELECT pg_get_userbyid(relowner), current_user FROM pg_class WHERE oid = to_regclass('alembic_version')"
     owner, user = connection.execute(text(asked)).one()
     if owner != user:
         what = f"the tables belong to the role {owner}, and this address names {user}"
