@@ -40,7 +40,7 @@ test-drawn: $(TOOLS) $(NETWORKS)
 
 # The tests of the record on PostgreSQL (tests/plugins/database.py); `make test-drawn` runs those of the chains, jobs,
 # crashes and races there.
-ON_POSTGRES = tests/store
+ON_POSTGRES = $(addprefix tests/, audit objects people recovery rig run server steps store verify web)
 test-postgres: $(TOOLS)
 	.ci/packages
 	$(BIN)/pytest --database postgresql -m "not (realtime or whole or sweep)" $(ON_POSTGRES)

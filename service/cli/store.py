@@ -27,7 +27,7 @@ from service.core.units import gigabytes
 from service.store.backup.backup import BackupOptions, BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore
 from service.store.copying import copy_record
-from service.store.database.postgres import prepare
+from service.store.database.preparing import prepare
 from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.journal.rebuild import RebuildReport, rebuild
 from service.store.moving import MoveReport, move_run
@@ -222,14 +222,25 @@ def prepare_command(
     ],
     role: Annotated[str, typer.Option("--role", help="The role of the program, which may not change evidence.")],
 ) -> None:
-    """Make the tables of a site in an empty PostgreSQL database, and grant the program's role what it needs.
+    """Make the tables of a site in an empty PostgreSQL database, or upgrade those of an earlier version.
 
-    The owner is used for nothing else. The role must exist: CREATE ROLE orthocapture LOGIN.
+    The program's role gets the privileges that it needs; it must exist: CREATE ROLE orthocapture LOGIN. The owner is
+    used for nothing else. Before an upgrade, end the programs of the site and back up. An interrupted upgrade changes
+    nothing: repeat it.
     """
     with reporting_errors():
-        prepare(owner_url, role)
-    console.print(f"The database is prepared for the role {role}. Write its address into a site.yaml:")
-    console.print("  database: postgresql://ROLE@HOST/DATABASE", markup=False)
+        done = prepare(owner_url, role)
+    if done.before is None:
+        console.print(f"The database is prepared for the role {role}. Write its address into a site.yaml:")
+        console.print("  database: postgresql://ROLE@HOST/DATABASE", markup=False)
+        return
+    if done.before == done.revision:
+        console.print(f"The database has this version's tables already (revision {done.revision}).")
+    else:
+        console.print(f"Upgraded from revision {done.before} to {done.revision}.")
+        console.print("  Run: orthocapture audit verify all", markup=False)
+    for line in done.granted:
+        console.print(f"  granted to {role}: {line}", markup=False)
 
 
 @store_app.command("copy")

@@ -186,8 +186,11 @@ def _recent(store: Store, window_s: float) -> Iterator[tuple[Row[Any], SignInRec
     """Yield row, payload and age of recorded sign-ins within the last `window_s` seconds, newest first."""
     since = _first_start(store)
     newest_first = _OF_SITE.where(event_index.c.kind == "sign_in_recorded").order_by(event_index.c.seq.desc())
-    with store.database.reading() as connection:
-        for row in connection.execution_options(yield_per=_AT_ONCE).execute(newest_first):
+    with (
+        store.database.reading() as connection,
+        connection.execution_options(yield_per=_AT_ONCE).execute(newest_first) as rows,
+    ):
+        for row in rows:
             age_s = _age_s(store, row, since)
             if age_s >= window_s:
                 return

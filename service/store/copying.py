@@ -205,9 +205,9 @@ def _copy_table(reading: Connection, writing: Connection, table: Table, counted:
 
 def copied_rows(connection: Connection, statement: Any) -> Iterator[Sequence[RowMapping]]:
     """Yield the rows of a statement as plain values, some at a time."""
-    rows = connection.execution_options(yield_per=_AT_ONCE).execute(statement)
-    for chunk in rows.mappings().partitions(_AT_ONCE):
-        yield list(chunk)
+    with connection.execution_options(yield_per=_AT_ONCE).execute(statement) as rows:
+        for chunk in rows.mappings().partitions(_AT_ONCE):
+            yield list(chunk)
 
 
 def _require_equal_ends(reading: Connection, writing: Connection) -> dict[str, str]:

@@ -20,7 +20,7 @@ from service.store.database.changes import notify
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text
 from service.store.event_index import EventToIndex, index_events
-from service.store.moved import require_here
+from service.store.moved import NAMED, require_here
 
 ROOT = "0" * 64  # previous_sha256 of the first event
 _SAFE = 2**53 - 1
@@ -34,6 +34,7 @@ _REF_FIELDS: set[str] = set(ArtefactRef.model_fields)
 _INSERT = insert(events)
 _MOVE_HEAD = update(heads).where(heads.c.run_id == bindparam("run"))
 _HEAD = select(heads.c.seq, heads.c.sha256).where(heads.c.run_id == bindparam("run"))
+_HEAD_AND_MOVES = _HEAD.add_columns(NAMED.label("named_in_moves"))  # in one query: each append asks it
 _LAST = (
     select(events.c.seq, events.c.sha256)
     .where(events.c.run_id == bindparam("run"))
@@ -189,8 +190,10 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
         IntegrityError: the chain does not end where the last append left it.
         StoreError: a payload has no canonical form, or the run was moved to another record.
     """
-    require_here(connection, run_id)
-    seq, previous = read_head(connection, run_id)
+    head = connection.execute(_HEAD_AND_MOVES, {"run": run_id}).one_or_none()
+    if head is not None and head.named_in_moves:
+        require_here(connection, run_id)
+    seq, previous = _checked_end(connection, run_id, None if head is None else (head.seq, head.sha256))
     appended: list[Event] = []
     rows: list[dict[str, Any]] = []
     to_index: list[EventToIndex] = []
@@ -224,9 +227,14 @@ def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
     Raises IntegrityError if the chain does not end where the last append left it.
     """
     head = connection.execute(_HEAD, {"run": run_id}).one_or_none()
+    return _checked_end(connection, run_id, None if head is None else (head.seq, head.sha256))
+
+
+def _checked_end(connection: Connection, run_id: str, head: tuple[int, str] | None) -> tuple[int, str]:
+    """Return the end of a chain, if its row in heads names it. Raises IntegrityError."""
     last = connection.execute(_LAST, {"run": run_id}).one_or_none()
     expected = (0, ROOT) if last is None else (last.seq, last.sha256)
-    if head is None or (head.seq, head.sha256) != expected:
+    if head != expected:
         raise IntegrityError(
             f"the chain of run {run_id} does not end where it was left",
             where=f"event {expected[0]}",

@@ -13,7 +13,9 @@ from service.store.event_index import OF_FACET
 from service.store.records import SITE
 
 _OF_MOVES = and_(event_facets.c.name == "moved_run", event_facets.c.run_id == SITE)
-# Put together once, for each append asks it. The last event of the site's chain that names a run decides.
+# Whether the site's chain says where a run goes on, or that it came here. Each append asks it together with its head.
+NAMED = select(event_facets.c.seq).where(_OF_MOVES, event_facets.c.value == bindparam("run")).exists()
+# The last event of the site's chain that names a run decides.
 _LAST = (
     select(event_index.c.seq, event_index.c.kind)
     .join(event_facets, OF_FACET)

@@ -32,6 +32,7 @@ from service.store.verification.anchor_checks import ReadAnchors, RecordSide, co
 from service.store.verification.verify import AuditReport, verify
 from tests.support.processes.object_store import Weed
 from tests.support.processes.postgres import Cluster
+from tests.support.record.outsider import copy_data, tamper
 from tests.support.record.store import start_run
 
 LOCKED_DAYS = 2
@@ -151,14 +152,14 @@ def test_with_the_store_away_it_is_counted_and_never_called_verified(site: Site)
 
 
 def rolled_back(site: Site, before: Path) -> None:
-    """Put the whole data folder back to an older copy, the log of signatures and the journal included."""
+    """Put the whole data folder back to an older copy: database, log of signatures and journal."""
     shutil.rmtree(site.data)
     shutil.copytree(before, site.data)
 
 
 def roll_back(site: Site) -> None:
     before = site.data.with_name("before")
-    shutil.copytree(site.data, before)
+    copy_data(site.data, before)
     site.sign_another_run()
     site.anchor()
     rolled_back(site, before)
@@ -270,13 +271,11 @@ def test_a_run_that_was_rolled_back_is_named_by_the_root_of_the_day(site: Site) 
     """The log and the site's chain are as they were: only the ends that the root names show it."""
     report = verify(site.data)
     run_id = report.runs[0]
-    with Store.open(site.data) as store, store.database.writing() as connection:
-        for trigger in ("events_no_update", "events_no_delete"):
-            connection.exec_driver_sql(f"DROP TRIGGER IF EXISTS {trigger}")
-        connection.exec_driver_sql(
-            f"UPDATE events SET sha256 = '{'0' * 64}' WHERE run_id = '{run_id}' AND seq = "
-            f"(SELECT max(seq) FROM events WHERE run_id = '{run_id}')"
-        )
+    tamper(
+        site.data,
+        f"UPDATE events SET sha256 = '{'0' * 64}' WHERE run_id = '{run_id}' AND seq = "
+        f"(SELECT max(seq) FROM events WHERE run_id = '{run_id}')",
+    )
     assert "names this as its last event" in site.faults()
 
 

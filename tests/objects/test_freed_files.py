@@ -162,7 +162,7 @@ def test_the_audit_counts_how_freed_files_were_checked(weed: Weed, tmp_path: Pat
     assert any("NOT read" in note for note in stated["notes"])
 
 
-def test_bundle_and_backup_hold_freed_files(weed: Weed, tmp_path: Path) -> None:
+def test_a_bundle_holds_freed_files(weed: Weed, tmp_path: Path) -> None:
     store, bench, objects = uploaded(weed, tmp_path)
     with store:
         names = images(store, bench)
@@ -174,6 +174,14 @@ def test_bundle_and_backup_hold_freed_files(weed: Weed, tmp_path: Path) -> None:
     with zipfile.ZipFile(written) as bundle:
         held = {Path(name).name for name in bundle.namelist()}
     assert set(names) <= held
+
+
+@pytest.mark.sqlite("backups and journal: a server has its own")
+def test_a_backup_holds_freed_files(weed: Weed, tmp_path: Path) -> None:
+    store, bench, objects = uploaded(weed, tmp_path)
+    with store:
+        names = images(store, bench)
+        free_spool(store, objects, AT_ONCE)
     assert not back_up(tmp_path / "data", tmp_path / "backup").state.faults
     restored = restore(tmp_path / "backup", tmp_path / "restored", actor=lambda _folder: "Ada")
     assert restored.ok, restored.audit.faults

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from argon2 import PasswordHasher
 from argon2.exceptions import VerifyMismatchError
+from sqlalchemy import text
 
 from service.people.person import PinRefusedError
 from service.people.sessions import People
@@ -31,7 +32,7 @@ def store_old(office: Office, column: str, secret: str) -> None:
     """Store the hash that an earlier version would have stored."""
     old = {"secret": QUICK_HASHES.hash(secret)}
     with office.store.database.writing() as connection:
-        connection.exec_driver_sql(f"UPDATE accounts SET {column} = :secret WHERE account = 'grace'", old)
+        connection.execute(text(f"UPDATE accounts SET {column} = :secret WHERE account = 'grace'"), old)
 
 
 def test_who_has_the_database_alone_cannot_guess_a_pin(office: Office) -> None:

@@ -16,7 +16,7 @@ from service.core.records.events import ServiceStarted, SignInRecorded
 from service.people.person import NotSignedInError, PinRefusedError
 from service.people.sessions import People
 from service.people.tries import failed_tries, wait_after_s
-from service.store.database.engine import SqliteDatabase
+from service.store.database.database import Database
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused
 from tests.support.record.outsider import outsider
@@ -221,14 +221,15 @@ def test_a_screen_that_is_signed_out_while_it_locks_is_nobodys(
 ) -> None:
     token, person = office.enter("grace")
     office.clock.passed_s = IDLE_S
-    writing = SqliteDatabase.writing
+    database = type(office.store.database)
+    writing = database.writing
 
-    def after_a_sign_out(self: SqliteDatabase) -> AbstractContextManager[Connection]:
+    def after_a_sign_out(self: Database) -> AbstractContextManager[Connection]:
         monkeypatch.undo()
         office.people.sign_out(person)
         return writing(self)
 
-    monkeypatch.setattr(SqliteDatabase, "writing", after_a_sign_out)
+    monkeypatch.setattr(database, "writing", after_a_sign_out)
     assert office.person(token, deliberate=True) is None
 
 

@@ -17,7 +17,7 @@ from service.store.records import SITE
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, web_site
 from tests.support.record.office import Office
-from tests.support.record.outsider import is_postgres, outsider
+from tests.support.record.outsider import outsider
 from tests.support.record.stepped_clock import SteppedClock
 
 HERE, ELSEWHERE = "10.0.0.7", "10.0.0.66"
@@ -149,8 +149,12 @@ def test_every_refusal_is_an_event_that_says_where(office: Office) -> None:
         ("grace", "locked_out", "", grace.screen),
     ]
     assert verify(office.data, SITE).ok
-    if is_postgres(office.data):  # it has no journal, in which these columns are that no event tells
-        return
+
+
+@pytest.mark.sqlite("backups and journal: a server has its own")
+def test_the_journal_shows_a_wait_that_was_ended_past_the_software(office: Office) -> None:
+    guess(office, FREE_FAILURES)
+    assert verify(office.data, SITE).ok
     with outsider(office.data) as connection:
         connection.execute("UPDATE accounts SET failures = 0, locked_until_utc_s = 0")
     assert any("accounts is not as it is in the journal" in fault.what for fault in verify(office.data, SITE).faults)

@@ -132,6 +132,7 @@ def test_a_write_ahead_log_that_is_cut_in_the_capture_ends_the_run_and_loses_not
         again.must_verify()
 
 
+@pytest.mark.sqlite("backups and journal: a server has its own")
 def test_a_paused_run_notices_within_a_second_that_the_record_was_altered(tmp_path: Path) -> None:
     data = tmp_path / "data"
     waited_s: list[float] = []

@@ -52,8 +52,8 @@ def forge(data: Path, run: str) -> list[int]:
     passed = [int(str(seq)) for (seq,) in rows(data, f"SELECT seq FROM checkpoints WHERE run_id = '{run}'")]
     captures = f"SELECT min(seq) FROM events WHERE kind = 'viewpoint_captured' AND run_id = '{run}'"
     ((captured,),) = rows(data, captures)
-    signed = f"SELECT min(seq) FROM events WHERE kind = 'run_signed' AND json_extract(payload, '$.run') = '{run}'"
-    ((site_seq,),) = rows(data, signed)
+    signings = rows(data, "SELECT seq, payload FROM events WHERE kind = 'run_signed' ORDER BY seq")
+    site_seq = next(seq for seq, payload in signings if json.loads(str(payload))["run"] == run)
     rewrite_to_the_end(data, run, int(str(captured)), actor="Eve")
     tamper(
         data,

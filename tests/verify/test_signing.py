@@ -23,7 +23,7 @@ from service.store.signatures.checkpoints import KeyFolder, signed_by, statement
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.outsider import INDEX_AGAIN, rows, tamper
+from tests.support.record.outsider import INDEX_AGAIN, rows, signer_events, tamper
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run
 from tests.support.record.tampering import alter_row, journal_anew, rewrite_to_the_end
@@ -54,6 +54,13 @@ def site_event(store: Store) -> None:
     store.record_site([SignInRecorded(account="ada", outcome="signed_in")], actor="ada")
 
 
+def kinds_of_site(store: Store) -> list[str]:
+    """Return the kinds of the events of the site's chain, without the one that names who signs."""
+    kinds = [event.payload.kind for event in store.events(SITE)]
+    assert kinds.count("signer_named") == signer_events(folder(store))
+    return [kind for kind in kinds if kind != "signer_named"]
+
+
 def test_a_checkpoint_signs_the_end_of_the_chain_once(store: Store) -> None:
     made = checkpoint(store, RUN)
     assert checkpoint(store, RUN) == made
@@ -77,10 +84,9 @@ def test_the_first_signature_makes_the_key_and_records_it(store: Store) -> None:
     ((private,),) = [list((folder(store) / "keys").iterdir())]
     assert stat.S_IMODE(private.stat().st_mode) == 0o600
     assert stat.S_IMODE(private.parent.stat().st_mode) == 0o700
-    kinds = [event.payload.kind for event in store.events(SITE)]
-    assert kinds == ["site_opened", "key_changed", "run_signed"]
-    assert made.site_seq == 2
-    assert store.checkpoints(SITE)[0].seq == 2
+    assert kinds_of_site(store) == ["site_opened", "key_changed", "run_signed"]
+    assert made.site_seq == 2 + signer_events(folder(store))
+    assert store.checkpoints(SITE)[0].seq == made.site_seq
 
 
 def test_the_key_file_is_never_readable_by_others(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,18 +143,22 @@ def test_the_sites_chain_is_protected_by_the_runs(store: Store) -> None:
     checkpoint(store, SITE)
     site_event(store)
     checkpoint(store, RUN)
+    last = 2 + signer_events(folder(store))
     tamper(
         folder(store),
-        "DELETE FROM checkpoints WHERE run_id = 'site' AND seq >= 3",
-        "DELETE FROM events WHERE run_id = 'site' AND seq >= 3",
-        "DELETE FROM event_index WHERE run_id = 'site' AND seq >= 3",
-        "UPDATE heads SET seq = 2, sha256 = (SELECT sha256 FROM events WHERE run_id = 'site' AND seq = 2) "
+        f"DELETE FROM checkpoints WHERE run_id = 'site' AND seq > {last}",
+        f"DELETE FROM events WHERE run_id = 'site' AND seq > {last}",
+        f"DELETE FROM event_index WHERE run_id = 'site' AND seq > {last}",
+        f"UPDATE heads SET seq = {last}, sha256 = (SELECT sha256 FROM events WHERE run_id = 'site' AND seq = {last}) "
         "WHERE run_id = 'site'",
         *INDEX_AGAIN,
     )
     journal_anew(folder(store))
     found = faults(store, RUN)
-    assert found[0] == f"run {RUN}, event 3: checkpoint: event 3 of the site's chain is not the one that it names"
+    assert (
+        found[0]
+        == f"run {RUN}, event 3: checkpoint: event {last + 1} of the site's chain is not the one that it names"
+    )
     assert all("signatures.jsonl" in fault for fault in found[1:]), "they were written down outside of the database"
     assert found[1:]
 
@@ -175,8 +185,9 @@ def test_another_key_in_the_sites_chain_is_found(store: Store) -> None:
     checkpoint(store, RUN)
     rewrite_to_the_end(folder(store), SITE, 2, actor="Eve")
     found = faults(store, RUN)
-    assert any("run site, event 2" in fault and "rewritten" in fault for fault in found)
-    assert any("event 2 of the site's chain is not" in fault for fault in found)
+    named = 2 + signer_events(folder(store))
+    assert any(f"run site, event {named}" in fault and "rewritten" in fault for fault in found)
+    assert any(f"event {named} of the site's chain is not" in fault for fault in found)
 
 
 def test_nothing_is_signed_at_the_end_of_a_cut_chain(store: Store) -> None:
@@ -216,7 +227,8 @@ def test_an_old_key_signs_nothing_new(store: Store, monkeypatch: pytest.MonkeyPa
     capture(store, RUN, "v3")
     monkeypatch.setattr(signing, "_present_key", lambda *_: stolen)
     checkpoint(store, RUN)
-    assert any("was not in use at event 4 of the site's chain" in fault for fault in faults(store, RUN))
+    named = 4 + signer_events(folder(store))
+    assert any(f"was not in use at event {named} of the site's chain" in fault for fault in faults(store, RUN))
 
 
 def test_a_lost_key_is_replaced_and_the_gap_is_told(store: Store) -> None:
@@ -263,7 +275,7 @@ def test_a_crash_while_the_first_key_is_made_leaves_nothing_dangling(
             checkpoint(store, RUN)
     (left,) = [path.stem for path in (folder(store) / "keys").iterdir()]
     assert checkpoint(store, RUN).key_id == left
-    assert [event.payload.kind for event in store.events(SITE)] == ["site_opened", "key_changed", "run_signed"]
+    assert kinds_of_site(store) == ["site_opened", "key_changed", "run_signed"]
     assert faults(store) == []
 
 

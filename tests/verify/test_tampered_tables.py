@@ -14,6 +14,7 @@ from service.people.credentials import token_sha256
 from service.people.person import LinkError, NotSignedInError, Person, PinRefusedError, SignInRefusedError
 from service.people.sessions import People
 from service.store.database.engine import database_path
+from service.store.durable_effects import SystemClock
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.log import NAME
 from service.store.signatures.signing import checkpoint
@@ -21,7 +22,7 @@ from service.store.signatures.timestamps import Authority, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
-from tests.support.record.outsider import copy_data, rows, tamper
+from tests.support.record.outsider import copy_data, is_postgres, rows, tamper
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import capture, enqueue, start_run
 from tests.support.record.time_stamp_authority import time_stamp_authority
@@ -160,9 +161,39 @@ ALTERED = {
 }
 
 
-@pytest.mark.parametrize("name", ALTERED)
+# The same in PostgreSQL, where the words are rows of a table.
+OF_POSTGRES = {
+    "an event that no search finds any more": (
+        "DELETE FROM event_words USING event_index AS i WHERE i.position = event_words.position "
+        "AND i.kind = 'viewpoint_captured'",
+        "event 2: the words by which auditors search are not",
+    ),
+    "a word that the event does not have": (
+        "UPDATE event_words SET words = words || CAST('no' AS tsvector) FROM event_index AS i "
+        "WHERE i.position = event_words.position AND i.kind = 'run_started'",
+        "event 1: the words by which auditors search are not the event's",
+    ),
+    "words of no event": ("INSERT INTO event_words VALUES (999, 'x')", "words of an event that is not"),
+    "no words at all": ("DELETE FROM event_words", "event 1: the words by which auditors search"),
+    "a row of the index of a run that never was": (
+        "INSERT INTO event_index (position, run_id, seq, kind, actor) "
+        "VALUES (999, 'ghost', 1, 'run_completed', 'runner')",
+        "run ghost, event 1: the index of events has a row of an event that is not there",
+    ),
+    "a lease on a run that never was": (
+        "INSERT INTO leases VALUES ('ghost', 'a', 'b', 1.0, 'c', 'd', 1, 1.0)",
+        "1 rows of the table leases belong to rows of runs that are not there",
+    ),
+}
+OF_SQLITE = pytest.mark.sqlite("SQLite's schema; tests/store/test_postgres.py alters PostgreSQL's")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=OF_SQLITE) if name == "the form of the words" else name for name in ALTERED],
+)
 def test_what_was_put_in_past_the_software_is_named(data: Path, name: str) -> None:
-    statement, said = ALTERED[name]
+    statement, said = (ALTERED | OF_POSTGRES if is_postgres(data) else ALTERED)[name]
     assert faults(data) == []
     tamper(data, "PRAGMA foreign_keys = OFF", statement)
     assert any(said in fault for fault in faults(data)), faults(data)
@@ -256,8 +287,8 @@ def test_a_row_that_its_own_table_forbids_is_refused_in_words(data: Path) -> Non
 
 
 def test_a_link_does_not_give_an_account_in_use_another_password(data: Path) -> None:
-    expires = "strftime('%s', 'now') + 3600.0"
-    tamper(data, f"INSERT INTO invitations VALUES ('{token_sha256('eve')}', 'emmy', {expires}, 0)")
+    expires_utc_s = SystemClock().utc_s() + 3600.0
+    tamper(data, f"INSERT INTO invitations VALUES ('{token_sha256('eve')}', 'emmy', {expires_utc_s}, 0)")
     with Store.open(data) as store, pytest.raises(LinkError, match="not valid"):
         People(store, QUICK_HASHES).accounts.accept("eve", "correct horse eve", PIN)
 
@@ -340,6 +371,7 @@ def test_a_column_with_one_large_letter_is_told(data: Path, table: str, column: 
     assert any(f"the table {table} is not the one that this software makes" in fault for fault in faults(data))
 
 
+@pytest.mark.sqlite("damages SQLite's file")
 def test_a_text_that_became_bytes_is_told_with_its_place(data: Path) -> None:
     rewrite_schema(data, "sessions", "STRICT", "")
     tamper(data, "UPDATE sessions SET csrf = CAST(csrf AS BLOB)")

@@ -285,8 +285,9 @@ def _event_lines(connection: Connection, run_id: str) -> Iterator[bytes]:
 
 def _rows(connection: Connection, table: Table, run_id: str, order: tuple[Any, ...]) -> Iterator[dict[str, Any]]:
     statement = select(table).where(table.c.run_id == run_id).order_by(*order)
-    for row in connection.execution_options(yield_per=500).execute(statement).mappings():
-        yield dict(row)
+    with connection.execution_options(yield_per=500).execute(statement) as rows:
+        for row in rows.mappings():
+            yield dict(row)
 
 
 def _lines(records: Iterable[Mapping[str, Any]]) -> Iterator[bytes]:

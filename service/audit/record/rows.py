@@ -97,8 +97,8 @@ def head(connection: Connection, run_id: str) -> tuple[int, str]:
 
 
 def plain(value: str) -> str:
-    """Return the text without lone surrogates, which a request may hold and SQLite refuses."""
-    return value.encode("utf-8", "replace").decode()
+    """Return the text without what a request may hold and a database refuses: lone surrogates and NUL."""
+    return value.encode("utf-8", "replace").decode().replace("\0", "\ufffd")
 
 
 P = TypeVar("P", bound=Record)

@@ -228,7 +228,7 @@ def artefacts_page(
         ),
         values | {"limit": size, "offset": (page - 1) * size},
     )
-    return ArtefactPage([to_artefact(row) for row in rows], page, pages, totals.n, totals.size)
+    return ArtefactPage([to_artefact(row) for row in rows], page, pages, totals.n, int(totals.size))
 
 
 def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[str, Any]]:

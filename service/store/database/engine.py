@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import Connection, Engine, RootTransaction, create_engine, event, inspect, text
+from sqlalchemy import Connection, Engine, RootTransaction, create_engine, event, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
 from sqlalchemy.util import LRUCache
@@ -24,6 +24,7 @@ from service.core.errors import StoreError
 from service.store.access import file_mode, open_new, require_access
 from service.store.database import new_schema
 from service.store.database.database import PATIENCE_S, Database
+from service.store.database.revisions import REVISIONS, migrate, refuse_foreign, refuse_newer, revision_of
 from service.store.durable_effects import Files
 from service.store.journal import changes
 from service.store.journal.journal import REBUILD, Journal, Tail
@@ -33,7 +34,6 @@ from service.store.records import RecordDamagedError, StoreVersionError
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
 _LOG = logging.getLogger(__name__)
-REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006", "0007")  # of migrations/versions, in order
 RESTORE = (
     "`orthocapture store rebuild` restores a damaged database from its journal; or restore the folder from a copy"
 )
@@ -44,7 +44,6 @@ _WRITING = ["journal_mode = WAL", "synchronous = FULL", "temp_store = MEMORY"]  
 _LOOK_EVERY_S = 1.0
 _ENDS_KEPT = 20  # chains whose last event is looked for
 _ONLY_NOW = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_CANTOPEN", "SQLITE_NOMEM", "SQLITE_INTERRUPT")
-_MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alembic reads with importlib.resources
 
 
 def database_path(data_dir: Path) -> Path:
@@ -318,7 +317,7 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
     database = SqliteDatabase(engine, path, files, patience_s, journal)
     try:
         with database.reading() as connection:
-            is_current = _revision(connection) == REVISIONS[-1]
+            is_current = revision_of(connection) == REVISIONS[-1]
         if not is_current:
             with database.writing() as connection:
                 _upgrade(connection, path)
@@ -371,8 +370,8 @@ def _checked_read_only(engine: Engine, path: Path, files: Files) -> SqliteDataba
     database = SqliteDatabase(engine, path, files)
     try:
         with database.reading() as connection:
-            present = _revision(connection)
-            _refuse_unknown(present, path)
+            present = revision_of(connection)
+            refuse_newer(present, str(path))
             _refuse_foreign(present, path)
         return database if present == REVISIONS[-1] else _upgraded_copy(database, path, files)
     except BaseException:
@@ -431,22 +430,6 @@ def _engine(address: str, *, writable: bool) -> Engine:
     return engine
 
 
-def _revision(connection: Connection) -> str | None:
-    if not inspect(connection).has_table("alembic_version"):
-        return None
-    revision: str | None = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
-    return revision
-
-
-def _refuse_unknown(present: str | None, path: Path) -> None:
-    if present is not None and present not in REVISIONS:
-        raise StoreVersionError(
-            f"this database was written by a newer version of orthocapture (its revision {present} is unknown here)",
-            where=str(path),
-            remedy="Install the version that wrote it, or a newer one; nothing was changed",
-        )
-
-
 def _refuse_foreign(present: str | None, path: Path) -> None:
     if present is None:
         raise StoreVersionError(
@@ -455,32 +438,16 @@ def _refuse_foreign(present: str | None, path: Path) -> None:
 
 
 def _upgrade(connection: Connection, path: Path) -> None:
-    present = _revision(connection)
-    _refuse_unknown(present, path)
+    present = revision_of(connection)
+    refuse_newer(present, str(path))
     if present is not None:
         if present != REVISIONS[-1]:
             migrate(connection)
         return
-    if inspect(connection).get_table_names():
-        raise StoreVersionError(
-            "this is not a database of orthocapture", where=str(path), remedy="Choose another data folder"
-        )
+    refuse_foreign(connection, str(path), "Choose another data folder")
     for statement in new_schema.STATEMENTS:
         connection.exec_driver_sql(statement)
     connection.execute(text("INSERT INTO alembic_version VALUES (:revision)"), {"revision": REVISIONS[-1]})
-
-
-def migrate(connection: Connection) -> None:
-    """Upgrade a database of an earlier version, or an empty one, by the migrations."""
-    # The import takes half a second and is needed only where an earlier version wrote the database.
-    from alembic import command  # noqa: PLC0415
-    from alembic.config import Config  # noqa: PLC0415
-
-    config = Config()
-    config.set_main_option("script_location", _MIGRATIONS)
-    config.set_main_option("path_separator", "os")
-    config.attributes["connection"] = connection
-    command.upgrade(config, "head")
 
 
 @contextmanager

@@ -13,13 +13,15 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, text
+from sqlalchemy import Connection, Engine, TextClause, create_engine, event, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from service.core.errors import ConfigurationError, StoreError
 from service.store.database import postgres_schema
 from service.store.database.database import PATIENCE_S, Database
+from service.store.database.revisions import REVISIONS, refuse_newer, revision_of
 from service.store.durable_effects import Files
 from service.store.records import StoreVersionError
 
@@ -28,10 +30,14 @@ WRITERS = 0x6F727468  # the advisory lock that writers hold; any number that nob
 LOCK_TIMEOUT_S = 30  # of one wait for another writer; then a warning is logged
 _HUNG_S = 120  # a client that does nothing within a transaction for so long loses it, so that a site goes on
 _AGAIN_S = 0.5
-_LOCK_NOT_AVAILABLE = "55P03"
+_LOCK_NOT_AVAILABLE, _DEADLOCK = "55P03", "40P01"
 _COMMITTED, _ABORTED = "committed", "aborted"
+_NUMBER = text("SELECT txid_current(), NULL")
+# Asked once the writer is alone, and so after any upgrade for which it has waited.
+_NUMBER_AND_REVISION = text("SELECT txid_current(), (SELECT version_num FROM alembic_version)")
 LOOK = "Look at the database server: does it run, can this machine reach it, has it room? What was recorded is safe"
 
+LOOK_HERE = "Look at the disk of the data folder: room, cable, permissions. What was recorded is safe"
 HUNG = "Another process has held the database for too long; look for one that hangs"
 
 
@@ -72,13 +78,31 @@ class PostgresDatabase(Database):
 
     @contextmanager
     def writing(self) -> Generator[Connection]:
-        """Yield a write transaction: commits at the end, rolls back on any exception. Raises StoreError."""
+        """Yield a write transaction: commits at the end, rolls back on any exception.
+
+        Raises:
+            StoreVersionError: the database was upgraded since this program opened it; nothing was written.
+            StoreError: the database refused.
+        """
+        with self._alone(_NUMBER_AND_REVISION) as connection:
+            yield connection
+
+    @contextmanager
+    def preparing(self) -> Generator[Connection]:
+        """Yield a write transaction in which tables may be made or changed; as `writing`, whatever the revision."""
+        with self._alone(_NUMBER) as connection:
+            yield connection
+
+    @contextmanager
+    def _alone(self, asked: TextClause) -> Generator[Connection]:
         with _store_errors(self.where), self._engine.connect() as connection:
             self._begin(connection)
             transaction = connection.get_transaction()
             assert transaction is not None  # the first statement has begun it
             try:
-                number = connection.execute(text("SELECT txid_current()")).scalar_one()
+                number, revision = connection.execute(asked).one()
+                if revision is not None:
+                    _require_current(revision, self.where)
                 yield connection
             except BaseException:
                 if not connection.invalidated:
@@ -145,8 +169,13 @@ class PostgresDatabase(Database):
         return self._engine
 
     def close(self) -> None:
-        """Close all connections."""
+        """Close all connections; one that a thread still uses as soon as it gives it back."""
+        event.listen(self._engine, "checkin", _close_now)
         self._engine.dispose()
+
+
+def _close_now(_connection: object, record: ConnectionPoolEntry) -> None:
+    record.invalidate()
 
 
 def open_postgres(url: str, files: Files, patience_s: float = PATIENCE_S) -> PostgresDatabase:
@@ -169,13 +198,25 @@ def open_postgres(url: str, files: Files, patience_s: float = PATIENCE_S) -> Pos
 
 def require_prepared(connection: Connection, where: str) -> None:
     """Raise StoreVersionError unless this version's tables are there."""
-    there = connection.execute(text("SELECT to_regclass('alembic_version') IS NOT NULL")).scalar_one()
-    found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar() if there else None
-    if found != postgres_schema.REVISION:
+    present = revision_of(connection)
+    if present is None:
         raise StoreVersionError(
-            f"this database is of another version ({found})" if found else "this database has not been prepared",
+            "this database has not been prepared",
             where=where,
             remedy="Prepare it as its owner: orthocapture store prepare URL-OF-THE-OWNER --role ROLE",
+        )
+    _require_current(present, where)
+
+
+def _require_current(present: str, where: str) -> None:
+    refuse_newer(present, where)
+    if present != REVISIONS[-1]:
+        raise StoreVersionError(
+            f"this database was prepared by an earlier version of orthocapture (its revision is {present}, and this "
+            f"version's {REVISIONS[-1]})",
+            where=where,
+            remedy="End the programs of the site, back up, and upgrade it as its owner: orthocapture store prepare "
+            "URL-OF-THE-OWNER --role ROLE",
         )
 
 
@@ -207,34 +248,23 @@ def powers_over_evidence(connection: Connection) -> list[str]:
     return found
 
 
-def prepare(owner_url: str, role: str) -> None:
-    """Make the tables of a site as their owner, and grant the program's role what it needs. Raises StoreError."""
-    engine = engine_for(owner_url)
-    where = engine.url.render_as_string(hide_password=True)
-    try:
-        with _store_errors(where), engine.begin() as connection:
-            if connection.execute(text("SELECT to_regclass('alembic_version') IS NOT NULL")).scalar_one():
-                raise StoreError(
-                    "this database was prepared already",
-                    where=where,
-                    remedy="Use it, or prepare another; nothing was changed",
-                )
-            postgres_schema.make(connection, role)
-    finally:
-        engine.dispose()
-
-
 @contextmanager
 def _store_errors(where: str) -> Generator[None]:
     try:
         yield
     except DBAPIError as error:
-        late = getattr(error.orig, "sqlstate", "") == _LOCK_NOT_AVAILABLE
+        late = getattr(error.orig, "sqlstate", "") in (_LOCK_NOT_AVAILABLE, _DEADLOCK)
         raise StoreError(
             f"the database refused: {_first_line(error.orig)}", where=where, remedy=HUNG if late else LOOK
         ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=where, remedy=LOOK) from error
+    except OSError as error:  # of files that are written within a transaction, such as keys
+        raise StoreError(
+            f"the data folder refused: {error.strerror or error}",
+            where=str(error.filename or where),
+            remedy=LOOK_HERE,
+        ) from error
 
 
 def _first_line(error: Any) -> str:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from sqlalchemy import Connection, text
 
+from service.store.database.revisions import REVISIONS, postgres_triggers
 from service.store.database.tables import metadata
 
-REVISION = "0007"  # as of the migrations: a database that was prepared by an earlier one is upgraded by them
 EVIDENCE = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index", "event_facets", "event_words")
 _ENDS = ("heads",)  # inserted and moved, never removed
 _OF_THE_MOMENT = ("jobs", "leases", "accounts", "invitations", "sessions", "control", "copies")
@@ -17,6 +17,17 @@ BEGIN
   RAISE EXCEPTION '% is append-only: % refused', TG_TABLE_NAME, lower(TG_OP);
 END """
 _REFUSE = f"CREATE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS $${_REFUSAL}$$"
+_FURTHER = (
+    "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL PRIMARY KEY)",
+    "CREATE TABLE event_words (position BIGINT NOT NULL PRIMARY KEY, words TSVECTOR NOT NULL)",
+    "CREATE INDEX event_words_by_word ON event_words USING gin (words)",
+    # The order of signatures; SQLite counts rows by itself, under this name.
+    "ALTER TABLE checkpoints ADD COLUMN rowid BIGINT GENERATED ALWAYS AS IDENTITY",
+    # The row of a run holds the hash of its first event, which refers to the row.
+    "ALTER TABLE events ALTER CONSTRAINT events_run_id_fkey DEFERRABLE INITIALLY IMMEDIATE",
+    "ALTER TABLE heads ALTER CONSTRAINT heads_run_id_fkey DEFERRABLE INITIALLY IMMEDIATE",
+    _REFUSE.replace("%", "%%"),
+)
 # What these tables have beside the columns and constraints of service.store.database.tables.
 FURTHER_COLUMNS: Mapping[tuple[str, str], object] = {
     ("alembic_version", "version_num"): ("character varying(32)", True),
@@ -47,38 +58,29 @@ def granted(table: str) -> tuple[str, ...]:
     return ("SELECT", "INSERT", "UPDATE", "DELETE") if table in _OF_THE_MOMENT else ("SELECT",)
 
 
-def make(connection: Connection, role: str) -> None:
-    """Make all tables as their owner, and grant a role what the program needs."""
+def make(connection: Connection) -> None:
+    """Make all tables as their owner: the same that the migrations make of the tables of an earlier version."""
     metadata.create_all(connection)
-    for statement in _statements(role):
-        connection.exec_driver_sql(statement.replace("%", "%%"))
-    connection.execute(text("INSERT INTO alembic_version VALUES (:revision)"), {"revision": REVISION})
+    for statement in (*_FURTHER, *(made for table in EVIDENCE for made in postgres_triggers(table))):
+        connection.exec_driver_sql(statement)
+    connection.execute(text("INSERT INTO alembic_version VALUES (:revision)"), {"revision": REVISIONS[-1]})
 
 
-def _statements(role: str) -> list[str]:
-    quoted = '"' + role.replace('"', '""') + '"'
-    return [
-        "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL PRIMARY KEY)",
-        "CREATE TABLE event_words (position BIGINT NOT NULL PRIMARY KEY, words TSVECTOR NOT NULL)",
-        "CREATE INDEX event_words_by_word ON event_words USING gin (words)",
-        # The order of signatures; SQLite counts rows by itself, under this name.
-        "ALTER TABLE checkpoints ADD COLUMN rowid BIGINT GENERATED ALWAYS AS IDENTITY",
-        # The row of a run holds the hash of its first event, which refers to the row.
-        "ALTER TABLE events ALTER CONSTRAINT events_run_id_fkey DEFERRABLE INITIALLY IMMEDIATE",
-        "ALTER TABLE heads ALTER CONSTRAINT heads_run_id_fkey DEFERRABLE INITIALLY IMMEDIATE",
-        _REFUSE,
-        *(
-            statement
-            for table in EVIDENCE
-            for statement in (
-                f"CREATE TRIGGER {table}_append_only BEFORE UPDATE OR DELETE ON {table} "
-                "FOR EACH ROW EXECUTE FUNCTION refuse_change()",
-                f"CREATE TRIGGER {table}_no_truncate BEFORE TRUNCATE ON {table} "
-                "FOR EACH STATEMENT EXECUTE FUNCTION refuse_change()",
-            )
-        ),
-        *(
-            f"GRANT {', '.join(granted(table))} ON {table} TO {quoted}"
-            for table in ("alembic_version", *EVIDENCE, *_ENDS, *_OF_THE_MOMENT)
-        ),
-    ]
+def grant(connection: Connection, role: str) -> tuple[str, ...]:
+    """Grant a role the missing privileges, as the owner of the tables; return them, one text a table."""
+    done: list[str] = []
+    asked = text("SELECT has_table_privilege(:role, :table, :power)")
+    for table in ("alembic_version", *EVIDENCE, *_ENDS, *_OF_THE_MOMENT):
+        missing = [
+            power
+            for power in granted(table)
+            if not connection.execute(asked, {"role": role, "table": table, "power": power}).scalar_one()
+        ]
+        if missing:
+            connection.exec_driver_sql(f"GRANT {', '.join(missing)} ON {table} TO {_quoted(role)}")
+            done.append(f"{', '.join(missing)} on {table}")
+    return tuple(done)
+
+
+def _quoted(role: str) -> str:
+    return '"' + role.replace("%", "%%").replace('"', '""') + '"'

@@ -20,18 +20,18 @@ from sqlalchemy import (
 )
 
 metadata = MetaData()
-# PostgreSQL's REAL and INTEGER have four bytes, and its texts are sorted by the language of the server.
-_INTEGER = Integer().with_variant(BigInteger(), "postgresql")
-_REAL = REAL().with_variant(Double(), "postgresql")
-_TEXT = Text().with_variant(Text(collation="C"), "postgresql")
+# Migrations use these, too: PostgreSQL's REAL and INTEGER have four bytes, and its texts are sorted by a language.
+INTEGER = Integer().with_variant(BigInteger(), "postgresql")
+DOUBLE = REAL().with_variant(Double(), "postgresql")
+TEXT = Text().with_variant(Text(collation="C"), "postgresql")
 
 runs = Table(
     "runs",
     metadata,
-    Column("run_id", _TEXT, primary_key=True),
-    Column("created_utc", _TEXT, nullable=False),
-    Column("simulated", _INTEGER, nullable=False),
-    Column("root_sha256", _TEXT, nullable=False),
+    Column("run_id", TEXT, primary_key=True),
+    Column("created_utc", TEXT, nullable=False),
+    Column("simulated", INTEGER, nullable=False),
+    Column("root_sha256", TEXT, nullable=False),
     CheckConstraint("simulated IN (0, 1)", name="runs_simulated"),
     sqlite_strict=True,
 )
@@ -39,15 +39,15 @@ runs = Table(
 events = Table(
     "events",
     metadata,
-    Column("run_id", _TEXT, ForeignKey("runs.run_id"), nullable=False),
-    Column("seq", _INTEGER, nullable=False),
-    Column("kind", _TEXT, nullable=False),
-    Column("at_utc", _TEXT, nullable=False),
-    Column("monotonic_s", _REAL, nullable=False),
-    Column("actor", _TEXT, nullable=False),
-    Column("payload", _TEXT, nullable=False),  # RFC 8785 canonical JSON
-    Column("previous_sha256", _TEXT, nullable=False),
-    Column("sha256", _TEXT, nullable=False),
+    Column("run_id", TEXT, ForeignKey("runs.run_id"), nullable=False),
+    Column("seq", INTEGER, nullable=False),
+    Column("kind", TEXT, nullable=False),
+    Column("at_utc", TEXT, nullable=False),
+    Column("monotonic_s", DOUBLE, nullable=False),
+    Column("actor", TEXT, nullable=False),
+    Column("payload", TEXT, nullable=False),  # RFC 8785 canonical JSON
+    Column("previous_sha256", TEXT, nullable=False),
+    Column("sha256", TEXT, nullable=False),
     PrimaryKeyConstraint("run_id", "seq"),
     UniqueConstraint("run_id", "previous_sha256", name="events_no_fork"),
     CheckConstraint("seq >= 1", name="events_seq"),
@@ -60,13 +60,13 @@ events = Table(
 event_index = Table(
     "event_index",
     metadata,
-    Column("position", _INTEGER, primary_key=True),  # over all runs, in the order of writing
-    Column("run_id", _TEXT, nullable=False),
-    Column("seq", _INTEGER, nullable=False),
-    Column("kind", _TEXT, nullable=False),
-    Column("step", _TEXT),
-    Column("device", _TEXT),
-    Column("actor", _TEXT, nullable=False),
+    Column("position", INTEGER, primary_key=True),  # over all runs, in the order of writing
+    Column("run_id", TEXT, nullable=False),
+    Column("seq", INTEGER, nullable=False),
+    Column("kind", TEXT, nullable=False),
+    Column("step", TEXT),
+    Column("device", TEXT),
+    Column("actor", TEXT, nullable=False),
     UniqueConstraint("run_id", "seq", name="event_index_once"),
     Index("event_index_by_kind", "run_id", "kind", "seq"),
     sqlite_strict=True,
@@ -76,10 +76,10 @@ event_index = Table(
 event_facets = Table(
     "event_facets",
     metadata,
-    Column("run_id", _TEXT, nullable=False),
-    Column("seq", _INTEGER, nullable=False),
-    Column("name", _TEXT, nullable=False),
-    Column("value", _TEXT, nullable=False),
+    Column("run_id", TEXT, nullable=False),
+    Column("seq", INTEGER, nullable=False),
+    Column("name", TEXT, nullable=False),
+    Column("value", TEXT, nullable=False),
     PrimaryKeyConstraint("run_id", "seq", "name"),
     Index("event_facets_by_value", "name", "value", "run_id"),
     sqlite_strict=True,
@@ -90,31 +90,31 @@ event_facets = Table(
 heads = Table(
     "heads",
     metadata,
-    Column("run_id", _TEXT, ForeignKey("runs.run_id"), primary_key=True),
-    Column("seq", _INTEGER, nullable=False),
-    Column("sha256", _TEXT, nullable=False),
+    Column("run_id", TEXT, ForeignKey("runs.run_id"), primary_key=True),
+    Column("seq", INTEGER, nullable=False),
+    Column("sha256", TEXT, nullable=False),
     sqlite_strict=True,
 )
 
 artefacts = Table(
     "artefacts",
     metadata,
-    Column("run_id", _TEXT, nullable=False),
-    Column("seq", _INTEGER, nullable=False),  # of the event that brought it
-    Column("position", _INTEGER, nullable=False),  # 0, 1, 2 … within that event
-    Column("sha256", _TEXT, nullable=False),
-    Column("kind", _TEXT, nullable=False),
-    Column("media_type", _TEXT, nullable=False),
-    Column("size_bytes", _INTEGER, nullable=False),
-    Column("original_name", _TEXT, nullable=False),
-    Column("device", _TEXT, nullable=False),
-    Column("step", _TEXT),
-    Column("attempt", _INTEGER),
-    Column("viewpoint", _TEXT),
-    Column("who", _TEXT, nullable=False),
-    Column("at_utc", _TEXT, nullable=False),
-    Column("monotonic_s", _REAL, nullable=False),
-    Column("record_sha256", _TEXT, nullable=False),  # over all of the above and the event's sha256
+    Column("run_id", TEXT, nullable=False),
+    Column("seq", INTEGER, nullable=False),  # of the event that brought it
+    Column("position", INTEGER, nullable=False),  # 0, 1, 2 … within that event
+    Column("sha256", TEXT, nullable=False),
+    Column("kind", TEXT, nullable=False),
+    Column("media_type", TEXT, nullable=False),
+    Column("size_bytes", INTEGER, nullable=False),
+    Column("original_name", TEXT, nullable=False),
+    Column("device", TEXT, nullable=False),
+    Column("step", TEXT),
+    Column("attempt", INTEGER),
+    Column("viewpoint", TEXT),
+    Column("who", TEXT, nullable=False),
+    Column("at_utc", TEXT, nullable=False),
+    Column("monotonic_s", DOUBLE, nullable=False),
+    Column("record_sha256", TEXT, nullable=False),  # over all of the above and the event's sha256
     PrimaryKeyConstraint("run_id", "seq", "position"),
     ForeignKeyConstraint(["run_id", "seq"], ["events.run_id", "events.seq"]),
     CheckConstraint("length(sha256) = 64", name="artefacts_hash_length"),
@@ -126,31 +126,31 @@ artefacts = Table(
 jobs = Table(
     "jobs",
     metadata,
-    Column("position", _INTEGER, primary_key=True),  # order of claiming
-    Column("job_id", _TEXT, nullable=False, unique=True),
-    Column("run_id", _TEXT, nullable=False),
-    Column("kind", _TEXT, nullable=False),
-    Column("step", _TEXT, nullable=False),
-    Column("attempt", _INTEGER, nullable=False),  # of the step
-    Column("idempotency_key", _TEXT, nullable=False),
-    Column("arguments", _TEXT, nullable=False),  # RFC 8785 canonical JSON
-    Column("state", _TEXT, nullable=False),
-    Column("tries", _INTEGER, nullable=False),  # how often a worker has claimed it
-    Column("try_limit", _INTEGER, nullable=False),
-    Column("enqueued_seq", _INTEGER, nullable=False),
-    Column("enqueued_utc", _TEXT, nullable=False),
-    Column("started_utc", _TEXT),
-    Column("ended_utc", _TEXT),
-    Column("ended_seq", _INTEGER),
-    Column("error", _TEXT),
-    Column("worker", _TEXT),
-    Column("token", _TEXT),
-    Column("until_utc_s", _REAL),
-    Column("host", _TEXT),
-    Column("boot", _TEXT),
-    Column("pid", _INTEGER),
-    Column("process_started_s", _REAL),
-    Column("priority", _INTEGER, nullable=False, server_default="1"),  # smaller is claimed first
+    Column("position", INTEGER, primary_key=True),  # order of claiming
+    Column("job_id", TEXT, nullable=False, unique=True),
+    Column("run_id", TEXT, nullable=False),
+    Column("kind", TEXT, nullable=False),
+    Column("step", TEXT, nullable=False),
+    Column("attempt", INTEGER, nullable=False),  # of the step
+    Column("idempotency_key", TEXT, nullable=False),
+    Column("arguments", TEXT, nullable=False),  # RFC 8785 canonical JSON
+    Column("state", TEXT, nullable=False),
+    Column("tries", INTEGER, nullable=False),  # how often a worker has claimed it
+    Column("try_limit", INTEGER, nullable=False),
+    Column("enqueued_seq", INTEGER, nullable=False),
+    Column("enqueued_utc", TEXT, nullable=False),
+    Column("started_utc", TEXT),
+    Column("ended_utc", TEXT),
+    Column("ended_seq", INTEGER),
+    Column("error", TEXT),
+    Column("worker", TEXT),
+    Column("token", TEXT),
+    Column("until_utc_s", DOUBLE),
+    Column("host", TEXT),
+    Column("boot", TEXT),
+    Column("pid", INTEGER),
+    Column("process_started_s", DOUBLE),
+    Column("priority", INTEGER, nullable=False, server_default="1"),  # smaller is claimed first
     ForeignKeyConstraint(["run_id", "enqueued_seq"], ["events.run_id", "events.seq"]),
     UniqueConstraint("run_id", "idempotency_key", name="jobs_idempotency"),
     CheckConstraint("state IN ('queued', 'running', 'finished', 'failed')", name="jobs_state"),
@@ -161,14 +161,14 @@ jobs = Table(
 leases = Table(
     "leases",
     metadata,
-    Column("run_id", _TEXT, ForeignKey("runs.run_id"), primary_key=True),
-    Column("holder", _TEXT, nullable=False),
-    Column("token", _TEXT, nullable=False),
-    Column("until_utc_s", _REAL, nullable=False),
-    Column("host", _TEXT, nullable=False),
-    Column("boot", _TEXT, nullable=False),
-    Column("pid", _INTEGER, nullable=False),
-    Column("process_started_s", _REAL, nullable=False),
+    Column("run_id", TEXT, ForeignKey("runs.run_id"), primary_key=True),
+    Column("holder", TEXT, nullable=False),
+    Column("token", TEXT, nullable=False),
+    Column("until_utc_s", DOUBLE, nullable=False),
+    Column("host", TEXT, nullable=False),
+    Column("boot", TEXT, nullable=False),
+    Column("pid", INTEGER, nullable=False),
+    Column("process_started_s", DOUBLE, nullable=False),
     sqlite_strict=True,
 )
 
@@ -176,15 +176,15 @@ leases = Table(
 checkpoints = Table(
     "checkpoints",
     metadata,
-    Column("run_id", _TEXT, nullable=False),
-    Column("seq", _INTEGER, nullable=False),  # of the last event that it covers
-    Column("sha256", _TEXT, nullable=False),  # of that event
-    Column("artefacts_sha256", _TEXT, nullable=False),  # over record_sha256 of the artefact rows up to it
-    Column("site_seq", _INTEGER, nullable=False),  # end of the site's chain, which tells the valid key
-    Column("site_sha256", _TEXT, nullable=False),
-    Column("at_utc", _TEXT, nullable=False),
-    Column("key_id", _TEXT, nullable=False),  # SHA-256 of the raw public key
-    Column("signature", _TEXT, nullable=False),  # base64, Ed25519 over service.store.signatures.checkpoints.statement
+    Column("run_id", TEXT, nullable=False),
+    Column("seq", INTEGER, nullable=False),  # of the last event that it covers
+    Column("sha256", TEXT, nullable=False),  # of that event
+    Column("artefacts_sha256", TEXT, nullable=False),  # over record_sha256 of the artefact rows up to it
+    Column("site_seq", INTEGER, nullable=False),  # end of the site's chain, which tells the valid key
+    Column("site_sha256", TEXT, nullable=False),
+    Column("at_utc", TEXT, nullable=False),
+    Column("key_id", TEXT, nullable=False),  # SHA-256 of the raw public key
+    Column("signature", TEXT, nullable=False),  # base64, Ed25519 over service.store.signatures.checkpoints.statement
     PrimaryKeyConstraint("run_id", "seq"),
     ForeignKeyConstraint(["run_id", "seq"], ["events.run_id", "events.seq"]),
     sqlite_strict=True,
@@ -194,11 +194,11 @@ checkpoints = Table(
 timestamps = Table(
     "timestamps",
     metadata,
-    Column("run_id", _TEXT, nullable=False),
-    Column("seq", _INTEGER, nullable=False),  # of the checkpoint
-    Column("authority", _TEXT, nullable=False),
-    Column("at_utc", _TEXT, nullable=False),
-    Column("token", _TEXT, nullable=False),  # base64 of the DER TimeStampResp
+    Column("run_id", TEXT, nullable=False),
+    Column("seq", INTEGER, nullable=False),  # of the checkpoint
+    Column("authority", TEXT, nullable=False),
+    Column("at_utc", TEXT, nullable=False),
+    Column("token", TEXT, nullable=False),  # base64 of the DER TimeStampResp
     PrimaryKeyConstraint("run_id", "seq", "authority"),
     ForeignKeyConstraint(["run_id", "seq"], ["checkpoints.run_id", "checkpoints.seq"]),
     sqlite_strict=True,
@@ -208,16 +208,16 @@ timestamps = Table(
 accounts = Table(
     "accounts",
     metadata,
-    Column("account", _TEXT, primary_key=True),  # the name to sign in with
-    Column("full_name", _TEXT, nullable=False),
-    Column("role", _TEXT, nullable=False),
-    Column("state", _TEXT, nullable=False),
-    Column("password_hash", _TEXT, nullable=False),  # argon2id; "" while invited
-    Column("pin_hash", _TEXT, nullable=False),  # argon2id; "" for none
-    Column("failures", _INTEGER, nullable=False),  # in a row
-    Column("locked_until_utc_s", _REAL, nullable=False),
-    Column("created_utc", _TEXT, nullable=False),
-    Column("badge_hash", _TEXT, nullable=False, server_default=""),  # argon2id; "" for none
+    Column("account", TEXT, primary_key=True),  # the name to sign in with
+    Column("full_name", TEXT, nullable=False),
+    Column("role", TEXT, nullable=False),
+    Column("state", TEXT, nullable=False),
+    Column("password_hash", TEXT, nullable=False),  # argon2id; "" while invited
+    Column("pin_hash", TEXT, nullable=False),  # argon2id; "" for none
+    Column("failures", INTEGER, nullable=False),  # in a row
+    Column("locked_until_utc_s", DOUBLE, nullable=False),
+    Column("created_utc", TEXT, nullable=False),
+    Column("badge_hash", TEXT, nullable=False, server_default=""),  # argon2id; "" for none
     CheckConstraint("role IN ('technician', 'supervisor', 'auditor', 'administrator')", name="accounts_role"),
     CheckConstraint("state IN ('invited', 'active', 'disabled')", name="accounts_state"),
     sqlite_strict=True,
@@ -227,24 +227,24 @@ accounts = Table(
 invitations = Table(
     "invitations",
     metadata,
-    Column("token_sha256", _TEXT, primary_key=True),
-    Column("account", _TEXT, nullable=False),  # "" for the first administrator, who chooses one
-    Column("expires_utc_s", _REAL, nullable=False),
-    Column("used", _INTEGER, nullable=False),
+    Column("token_sha256", TEXT, primary_key=True),
+    Column("account", TEXT, nullable=False),  # "" for the first administrator, who chooses one
+    Column("expires_utc_s", DOUBLE, nullable=False),
+    Column("used", INTEGER, nullable=False),
     sqlite_strict=True,
 )
 
 sessions = Table(
     "sessions",
     metadata,
-    Column("token_sha256", _TEXT, primary_key=True),
-    Column("account", _TEXT, ForeignKey("accounts.account"), nullable=False),
-    Column("screen", _TEXT, nullable=False, unique=True),  # a short name for people and for the record
-    Column("csrf", _TEXT, nullable=False),
-    Column("created_utc_s", _REAL, nullable=False),
-    Column("seen_utc_s", _REAL, nullable=False),  # last action of the person; the page's own requests do not count
-    Column("locked", _INTEGER, nullable=False),
-    Column("pin_failures", _INTEGER, nullable=False),
+    Column("token_sha256", TEXT, primary_key=True),
+    Column("account", TEXT, ForeignKey("accounts.account"), nullable=False),
+    Column("screen", TEXT, nullable=False, unique=True),  # a short name for people and for the record
+    Column("csrf", TEXT, nullable=False),
+    Column("created_utc_s", DOUBLE, nullable=False),
+    Column("seen_utc_s", DOUBLE, nullable=False),  # last action of the person; the page's own requests do not count
+    Column("locked", INTEGER, nullable=False),
+    Column("pin_failures", INTEGER, nullable=False),
     sqlite_strict=True,
 )
 
@@ -252,12 +252,12 @@ sessions = Table(
 control = Table(
     "control",
     metadata,
-    Column("run_id", _TEXT, ForeignKey("runs.run_id"), primary_key=True),
-    Column("screen", _TEXT, nullable=False),  # "" for nobody
-    Column("account", _TEXT, nullable=False),
-    Column("asked_by_screen", _TEXT, nullable=False),
-    Column("asked_by_account", _TEXT, nullable=False),
-    Column("asked_utc_s", _REAL, nullable=False),  # negative: that was refused, at the time without the sign
+    Column("run_id", TEXT, ForeignKey("runs.run_id"), primary_key=True),
+    Column("screen", TEXT, nullable=False),  # "" for nobody
+    Column("account", TEXT, nullable=False),
+    Column("asked_by_screen", TEXT, nullable=False),
+    Column("asked_by_account", TEXT, nullable=False),
+    Column("asked_utc_s", DOUBLE, nullable=False),  # negative: that was refused, at the time without the sign
     sqlite_strict=True,
 )
 
@@ -265,11 +265,11 @@ control = Table(
 copies = Table(
     "copies",
     metadata,
-    Column("sha256", _TEXT, nullable=False),
-    Column("place", _TEXT, nullable=False),
-    Column("size_bytes", _INTEGER, nullable=False),
-    Column("at_utc", _TEXT, nullable=False),  # when it was first confirmed
-    Column("checked_utc", _TEXT, nullable=False),  # when it was last confirmed
+    Column("sha256", TEXT, nullable=False),
+    Column("place", TEXT, nullable=False),
+    Column("size_bytes", INTEGER, nullable=False),
+    Column("at_utc", TEXT, nullable=False),  # when it was first confirmed
+    Column("checked_utc", TEXT, nullable=False),  # when it was last confirmed
     PrimaryKeyConstraint("sha256", "place"),
     sqlite_strict=True,
 )

@@ -99,4 +99,5 @@ def database_damage(connection: Connection) -> tuple[str, ...]:
 def event_rows(connection: Connection, run_id: str) -> Iterator[Mapping[Any, Any]]:
     """Yield the events of a run in order, read a part at a time."""
     statement = select(events).where(events.c.run_id == run_id).order_by(events.c.seq)
-    return iter(connection.execution_options(yield_per=500).execute(statement).mappings())
+    with connection.execution_options(yield_per=500).execute(statement) as rows:
+        yield from rows.mappings()

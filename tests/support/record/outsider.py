@@ -65,6 +65,11 @@ def is_postgres(data_dir: Path) -> bool:
     return named_database(data_dir) is not None
 
 
+def signer_events(data_dir: Path) -> int:
+    """Return how many events name who signs, in the site's chain before its first signature: one in PostgreSQL."""
+    return int(is_postgres(data_dir))
+
+
 @contextmanager
 def outsider(data_dir: Path) -> Generator[Outsider]:
     """Connect to the database of a data folder past the program; commits at the end of the block."""

@@ -262,8 +262,8 @@ def test_nothing_but_recorded_exports_can_be_fetched(web: WebSite, run: str, nam
 
 def test_a_recorded_name_that_leads_elsewhere_is_none(web: WebSite) -> None:
     run = web.record_run()
-    target = web.site.data / "orthocapture.sqlite"
-    for name in ("../orthocapture.sqlite", "link.zip"):
+    target = web.site.data / "keys" / "pepper"
+    for name in ("../keys/pepper", "link.zip"):
         size = target.stat().st_size
         record = EvidenceExported(
             what="bundle", file_name=name, sha256="0" * 64, size_bytes=size, head_sha256="0" * 64

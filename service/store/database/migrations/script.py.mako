@@ -3,6 +3,9 @@
 import sqlalchemy as sa
 from alembic import op
 
+from service.store.database.revisions import refuse_changes
+from service.store.database.tables import DOUBLE, INTEGER, TEXT
+
 revision = ${repr(up_revision)}
 down_revision = ${repr(down_revision)}
 branch_labels = ${repr(branch_labels)}
