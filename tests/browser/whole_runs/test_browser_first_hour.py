@@ -24,6 +24,7 @@ from service.people.person import Role
 from tests.support.pages.accounts import PASSWORD
 from tests.support.pages.browser import accept_on_page, invite_on_page, screen, set_up_administrator
 from tests.support.pages.technician import Technician
+from tests.support.processes.runners import no_runner_left
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, RIG_LOCK
 
@@ -120,7 +121,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def terminals(clone: Path, tmp_path: Path) -> Iterator[list[Shell]]:
     """Three terminals: of the rig, of the pages, and one to work in."""
     opened = [Shell(clone, tmp_path) for _ in range(3)]
-    with RIG_LOCK:
+    with RIG_LOCK, no_runner_left(clone / "runs"):
         yield opened
         for terminal in reversed(opened):
             terminal.close()
