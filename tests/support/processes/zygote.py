@@ -48,7 +48,8 @@ OF_PAGES = {
 VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
     "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",
 ))  # fmt: skip
-OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", *VENDORS)
+CLUSTER = ("distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
+OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", *VENDORS, *CLUSTER)
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
 _statuses: list[int] = []  # of this process, if it is a fork that has come to its end
