@@ -33,7 +33,7 @@ from tests.support.scenes.scene_photographs import photograph, pose_above
 
 Array = NDArray[np.float64]
 
-WIDTH, N_IMAGES, SEED = 720, 6, 7
+WIDTH, N_IMAGES, SEED = 576, 6, 7
 KEYS = {
     "T_world_scan", "scale", "covariance", "rms_px", "mean_radial_error_mm", "mean_reprojection_error_px", "n_images",
     "markers", "images",
@@ -187,20 +187,20 @@ def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, rec
 
 
 @pytest.mark.slow
-def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
+def test_mesh_and_control_indices(capture: Capture, few: Path, tmp_path: Path) -> None:
     out = tmp_path / "result.json"
     mesh: dict[str, object] = {
         "spheres": None,
         "mesh": capture.mesh,
         "radius_mm": 15,
         "mesh_unit": "mm",
-        "workers": 1,
+        "images": few,
     }
     record = registered(register(capture, out, **mesh), out)
     assert record["mean_radial_error_mm"] is None
     centres = np.array(record["spheres_mm"]["registration"])
     assert len(centres) == 13
-    assert true_error_mm(record, capture) < 0.1
+    assert true_error_mm(record, capture) < 0.15
     # The user reads the indices from this list and runs again.
     gaps = np.linalg.norm(centres[:, None] - 1e3 * capture.control_scan_m, axis=2)
     control = gaps.argmin(axis=0)
@@ -208,7 +208,7 @@ def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
     record = registered(register(capture, out, **mesh, control=",".join(map(str, control))), out)
     assert len(record["spheres_mm"]["registration"]) == 10
     assert np.allclose(record["spheres_mm"]["control"], centres[sorted(control)])
-    assert true_error_mm(record, capture) < 0.1
+    assert true_error_mm(record, capture) < 0.15
     assert record["mean_radial_error_mm"] < 0.2
 
 
@@ -309,7 +309,7 @@ def test_photographs_of_another_size_than_the_calibrated(capture: Capture, few: 
         assert picture is not None
         cv2.imwrite(str(file), picture[:-40])
     out = tmp_path / "result.json"
-    refused(register(capture, out, images=few), out, f"{WIDTH} × 440 px", "camera model is for")
+    refused(register(capture, out, images=few), out, f"{WIDTH} × 344 px", "camera model is for")
 
 
 @pytest.mark.slow
