@@ -41,7 +41,8 @@ _MODULES = (COMMANDS, SIMULATORS, HOST, *OF_PAGES, *OF_TESTS)
 # (cv2, gdcm, gphoto2, torch), and by drivers that tests use in their own process.
 SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
 _READ_LATER = ("ORTHOCAPTURE_", "PYTEST_", "GENTL_CAMERA", "OPENCV_FFMPEG_", "XDG_CONFIG_HOME", *SET_BY_IMPORTS)
-_DONE_BY_ZYGOTE = ("PYTHONPATH", "PYTHONUNBUFFERED")  # it does what the interpreter would with these
+# What the zygote does in the place of the interpreter, and of OpenCV: each command silences that for what it starts.
+_DONE_BY_ZYGOTE = ("PYTHONPATH", "PYTHONUNBUFFERED", "OPENCV_LOG_LEVEL")
 _ENVIRONMENT = dict(os.environ)  # before any test has changed it
 _NUMBER_BYTES = 8
 _PARENT = "--parent"
