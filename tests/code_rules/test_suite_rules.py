@@ -20,7 +20,7 @@ from tests.plugins.draw import drawn
 from tests.support.suite.marks import costs_of, disagreements, remarked, settled
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = "[pytest]\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
+SETTINGS = "[pytest]\naddopts = -p no:schemathesis\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
 
 
 def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() -> None:
