@@ -225,7 +225,6 @@ def refusal_of(scheduler: Scheduler) -> str:
     return ""
 
 
-@pytest.mark.slow
 def test_a_cluster_is_reached_by_tls_with_the_files_of_its_authority(tmp_path: Path) -> None:
     certificate, key = self_signed(tmp_path)
     options = ("--tls-ca-file", str(certificate), "--tls-cert", str(certificate), "--tls-key", str(key))

@@ -62,7 +62,6 @@ def test_a_tenth_is_drawn_by_the_seed_and_every_unit_has_its_turn() -> None:
     assert drawn("a", []) == set()
 
 
-@pytest.mark.slow
 def test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed(tmp_path: Path) -> None:
     source = """
 import pytest

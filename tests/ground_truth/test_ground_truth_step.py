@@ -235,7 +235,6 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     assert np.all(columns["source"][within] == 0)
 
 
-@pytest.mark.slow
 def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(fused_run: Bench) -> None:
     state, _, points = fused(fused_run)
     (number,) = state.steps["ground_truth"].result["details"]["taken_away"]

@@ -131,13 +131,11 @@ def refused_at(site: NamedSite, place: str, names: Iterable[str]) -> None:
         assert attempt.refused_for_its_name, attempt
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("place", "name"), in_turn(FEW[:4]))
 def test_where_there_are_accounts_nobody_else_acts(site: NamedSite, place: str, name: str) -> None:
     refused_at(site, place, (name,))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("place", "name"), in_turn(FEW_OF_NOBODY))
 def test_where_there_are_none_nobody_acts_under_a_name_that_is_no_persons(
     without: NamedSite, place: str, name: str
@@ -152,6 +150,7 @@ def test_every_name_at_every_place_where_there_are_accounts(site: NamedSite, pla
     refused_at(site, place, (*NAMES, *HER_OWN, *PEOPLE))
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("place", COMMANDS)
 def test_every_name_at_every_place_where_there_are_none(without: NamedSite, place: str) -> None:

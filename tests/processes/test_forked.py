@@ -181,6 +181,7 @@ def test_the_devices_of_a_forked_rig_are_forks_too_and_end_with_it(tmp_path: Pat
     assert not (tmp_path / "lightbox").is_symlink()  # the light box ended in order
 
 
+@pytest.mark.slow
 def test_the_drivers_of_a_forked_command_are_forks_too(tmp_path: Path) -> None:
     """They were real starts for long, since each command silences OpenCV by a variable of the environment."""
     seen: dict[int, list[str]] = {}

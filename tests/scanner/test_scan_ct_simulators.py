@@ -117,7 +117,6 @@ def test_the_scan_is_in_a_frame_of_its_own_and_in_millimetres(sprayed: Scanned, 
     assert 300_000 < sprayed.mesh.findings["faces"] < 1_200_000
 
 
-@pytest.mark.slow
 def test_the_underside_and_what_lies_deep_are_missing(coarse: Scanned) -> None:
     world = coarse.world_m
     assert world[:, 2].min() > -0.0185
@@ -132,7 +131,6 @@ def test_without_spray_more_is_missing(sprayed: Scanned, glossy: Scanned) -> Non
     assert glossy.tissue_area_m2() < 1.1 * sprayed.tissue_area_m2()
 
 
-@pytest.mark.slow
 def test_normals_face_outwards(coarse: Scanned) -> None:
     normals = coarse.mesh.mesh.normals @ coarse.T_world_scan[:3, :3].T
     board = np.abs(coarse.world_m[:, 2]) < 0.0005
