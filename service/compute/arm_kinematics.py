@@ -98,23 +98,14 @@ def dh_jacobian(frames: Array) -> Array:
     Args:
         frames: (N, J + 1, 4, 4) frames from `chain`.
     """
-    axes = frames.shape[1] - 1
-    R_flange, flange = frames[:, -1, :3, :3], frames[:, -1, :3, 3]
-    J = np.zeros((len(frames), 6, 4 * axes))
-    to_flange = np.swapaxes(R_flange, 1, 2)
-    for i in range(axes):
-        z, before = frames[:, i, :3, 2], frames[:, i, :3, 3]
-        x, after = frames[:, i + 1, :3, 0], frames[:, i + 1, :3, 3]
-        columns = (
-            (x, np.zeros_like(x)),
-            (z, np.zeros_like(z)),
-            (np.cross(x, flange - after), x),
-            (np.cross(z, flange - before), z),
-        )
-        for k, (shift, turn) in enumerate(columns):
-            J[:, :3, 4 * i + k] = np.einsum("nij,nj->ni", to_flange, shift)
-            J[:, 3:, 4 * i + k] = np.einsum("nij,nj->ni", to_flange, turn)
-    return J
+    R_flange, flange = frames[:, -1, :3, :3], frames[:, -1, None, :3, 3]
+    z, before = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
+    x, after = frames[:, 1:, :3, 0], frames[:, 1:, :3, 3]
+    none = np.zeros_like(x)
+    shifts = np.stack([x, z, np.cross(x, flange - after), np.cross(z, flange - before)], axis=2)
+    turns = np.stack([none, none, x, z], axis=2)
+    moved = np.concatenate([np.einsum("nji,nakj->niak", R_flange, rows) for rows in (shifts, turns)], axis=1)
+    return moved.reshape(len(frames), 6, -1)
 
 
 def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:

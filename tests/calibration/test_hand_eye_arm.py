@@ -431,7 +431,7 @@ def test_suggested_poses_keep_what_they_promise() -> None:
 @pytest.mark.slow
 def test_the_command_calibrates_photographs(tmp_path: Path) -> None:
     scene = Scene.generate(4, arm_errors="gears")  # whose photographs all have the whole board
-    session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=900)
+    session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=720)
     camera, count = session.corners.camera, len(session.T_base_flange)
     names = [f"v{i:02d}.png" for i in range(count)]
     (tmp_path / "images").mkdir()

@@ -43,7 +43,6 @@ def test_every_command_that_reads_it_prints_escapes(recorded: tuple[Path, str, s
         assert "\\x1b[3A" in as_words[1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("which", ["completed", pytest.param("open", marks=pytest.mark.sweep)])
 def test_no_page_makes_elements_of_it(recorded: tuple[Path, str, str], tmp_path: Path, which: str) -> None:
     data, *runs = recorded

@@ -1,4 +1,7 @@
-"""What is parallel inside a job has the same bits in one process, in local ones and on a cluster, kind by kind."""
+"""What is parallel inside a job has the same bits in one process, in local ones and on a cluster, kind by kind.
+
+A sweep over the kinds: that of the outlines, in test_cluster.py, always runs.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,7 @@ from tests.support.scenes.textured_scene import camera_of_width, render, ring_of
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_features_and_matches(cluster: Cluster, tmp_path: Path) -> None:
     camera, scene = camera_of_width(320), slabs()
     files = {f"view_{k}": tmp_path / f"view_{k}.png" for k in range(5)}
@@ -49,9 +53,18 @@ def test_features_and_matches(cluster: Cluster, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("export_format", ["matching", "hdf5"])
-def test_exports(cluster: Cluster, tmp_path: Path, export_format: str) -> None:
-    """Undistorted pictures and depth, and all that other formats are made from; in one of two a worker is killed."""
+@pytest.mark.sweep
+def test_undistorted_pictures_and_depth_though_a_worker_is_killed(cluster: Cluster, tmp_path: Path) -> None:
+    exports(cluster, tmp_path, "matching")
+
+
+@pytest.mark.slow
+@pytest.mark.sweep
+def test_all_that_other_formats_are_made_from(cluster: Cluster, tmp_path: Path) -> None:
+    exports(cluster, tmp_path, "hdf5")
+
+
+def exports(cluster: Cluster, tmp_path: Path, export_format: str) -> None:
     camera = CameraModel(320, 240, 380.0, 382.0, 156.0, 123.0, -0.12, 0.04, 8e-4, -5e-4)
     dataset = posed_data_set(tmp_path, 4, camera=camera)
 
@@ -76,6 +89,7 @@ def test_exports(cluster: Cluster, tmp_path: Path, export_format: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_depth_maps_of_pairs(cluster: Cluster) -> None:
     camera = dataclasses.replace(camera_of_width(320), k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
     views = [StereoView(render(slabs(), camera, T, 1), camera, T) for T in ring_of_poses(24)[:4]]

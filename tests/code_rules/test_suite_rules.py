@@ -20,7 +20,7 @@ from tests.plugins.draw import drawn
 from tests.support.suite.marks import costs_of, disagreements, remarked, settled
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = "[pytest]\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
+SETTINGS = "[pytest]\naddopts = -p no:schemathesis\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
 
 
 def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() -> None:
@@ -62,7 +62,6 @@ def test_a_tenth_is_drawn_by_the_seed_and_every_unit_has_its_turn() -> None:
     assert drawn("a", []) == set()
 
 
-@pytest.mark.slow
 def test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed(tmp_path: Path) -> None:
     source = """
 import pytest

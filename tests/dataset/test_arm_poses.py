@@ -79,7 +79,6 @@ def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, nam
     assert dataset.statement["pose_covariance"] == dataset.about.covariance
 
 
-@pytest.mark.slow
 def test_the_outlines_of_each_image_are_in_the_covariance_of_poses_by_the_spheres(
     run: RecordedRun, tmp_path: Path
 ) -> None:

@@ -288,8 +288,7 @@ def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("spacing_mm", [0.1, pytest.param(0.4, marks=pytest.mark.sweep)])
+@pytest.mark.parametrize("spacing_mm", [0.4, pytest.param(0.1, marks=pytest.mark.sweep)])
 def test_the_picture_of_a_small_surface_has_no_paper_between_its_samples(tmp_path: Path, spacing_mm: float) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
     ball.export(tmp_path / "gt.ply")

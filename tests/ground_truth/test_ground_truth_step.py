@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -104,8 +105,9 @@ class TwoSurfaces(BenchRig):
         return cast(CtSource, self.suite)
 
 
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
+@contextmanager
+def begun(tmp_path: Path) -> Generator[Bench]:
+    """A run of the protocol that has not begun yet."""
     rig = TwoSurfaces()
     rig.shelf = Shelf(tmp_path / "scan.ply", with_spheres(scan_mesh(), CENTRES_M))
     in_ct = with_spheres(ct_mesh(), np.vstack([CENTRES_M, TAKEN_M]))
@@ -114,9 +116,23 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         yield begin_computing_run(store, PROTOCOL, tmp_path, rig)
 
 
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with begun(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def fused_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """A run that is completed, for the tests that only read it."""
+    with begun(tmp_path_factory.mktemp("fused")) as made:
+        made.run()
+        yield made
+
+
 def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]:
-    """The state, the fused mesh's properties, and its vertices in metres."""
-    state = bench.run()
+    """The state of a completed run, the fused mesh's properties, and its vertices in metres."""
+    state = bench.state()
     assert state.status == "completed", state
     (mesh,) = (ref for ref in state.steps["ground_truth"].artefacts if ref.kind == "ground_truth_mesh")
     columns, faces = read_ply(bench.store.artefact_path(mesh.sha256))
@@ -126,8 +142,8 @@ def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]
 
 
 @pytest.mark.slow
-def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None:
-    state, columns, points = fused(bench)
+def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(fused_run: Bench) -> None:
+    state, columns, points = fused(fused_run)
     measures = state.steps["ground_truth"].measures
     assert measures["spheres_compared"] == len(CENTRES_M)
     assert measures["sphere_distance_change_max_mm"] < 0.02
@@ -143,24 +159,26 @@ def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None
     boxed = np.all(np.abs(points - [-0.020, -0.015, 0.030]) < [0.0028, 0.0028, 0.0098], axis=1)
     assert np.all(columns["source"][boxed] == 0)
     picture = next(ref for ref in state.steps["ground_truth"].artefacts if ref.kind == "fusion_picture")
-    shown = cv2.imread(str(bench.store.artefact_path(picture.sha256)))
+    shown = cv2.imread(str(fused_run.store.artefact_path(picture.sha256)))
     assert shown is not None
     assert shown.std() > 10
-    bench.must_verify()
+    fused_run.must_verify()
 
 
 @pytest.mark.slow
-def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: Bench, tmp_path: Path) -> None:
-    state, columns, points = fused(bench)
+def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(fused_run: Bench, tmp_path: Path) -> None:
+    state, columns, points = fused(fused_run)
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="truth.yaml")
-    summary = summarise(bench.store, bench.run_id, loaded.protocol)
+    summary = summarise(fused_run.store, fused_run.run_id, loaded.protocol)
     fusion = recorded_fusion(summary)
     assert fusion is not None
     exported = summary.ground_truth().mesh
     assert exported.source is not None
     assert np.array_equal(exported.source, columns["source"])
     assert exported.sigma_m == pytest.approx(1e-3 * columns["sigma_mm"], rel=1e-6)
-    mesh = SimplifiedMesh(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
+    mesh = SimplifiedMesh(
+        points, read_ply(fused_run.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1]
+    )
     truth, measures = fused_mesh(tmp_path, summary, fusion, mesh), state.steps["ground_truth"].measures
     assert (truth.ct_share, truth.sigma_median_mm) == (measures["ct_share"], measures["sigma_median_mm"])
     assert truth.ct_share + truth.scan_share + truth.blend_share == pytest.approx(1)
@@ -204,6 +222,7 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     drawn = RegionDrawn(step="ground_truth", source="ct", corners_m=corners, seen_along=(0.0, 0.0, 1.0))
     elsewhere = drawn.model_copy(update={"step": "another"})
     bench.store.record(bench.run_id, [drawn, elsewhere], actor="grace")
+    bench.run()
     state, columns, points = fused(bench)
     regions = state.steps["ground_truth"].result["details"]["regions"]
     assert [(r["by"], r["frame"]) for r in regions] == [("protocol truth 1", "scan"), ("grace", "scan")]
@@ -216,9 +235,8 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     assert np.all(columns["source"][within] == 0)
 
 
-@pytest.mark.slow
-def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(bench: Bench) -> None:
-    state, _, points = fused(bench)
+def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(fused_run: Bench) -> None:
+    state, _, points = fused(fused_run)
     (number,) = state.steps["ground_truth"].result["details"]["taken_away"]
     in_ct = np.array(state.steps["ct"].result["spheres_m"][number])
     assert T_WORLD_CT[:3, :3] @ in_ct + T_WORLD_CT[:3, 3] == pytest.approx(TAKEN_M, abs=1e-4)
@@ -238,10 +256,9 @@ def test_without_a_ct_the_step_says_so_and_passes(bench: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_the_way_through_the_cameras_is_compared_with_the_spheres(bench: Bench, tmp_path: Path) -> None:
-    fused(bench)
-    (job,) = (j for j in bench.state().steps["ground_truth"].jobs.values() if j.kind == "fuse")
-    steps = bench.state().steps
+def test_the_way_through_the_cameras_is_compared_with_the_spheres(fused_run: Bench, tmp_path: Path) -> None:
+    (job,) = (j for j in fused_run.state().steps["ground_truth"].jobs.values() if j.kind == "fuse")
+    steps = fused_run.state().steps
     off = transform(Rotation.identity(), np.array([2e-4, 0.0, 0.0]))
     T_world_scan = transform(Rotation.from_rotvec([0.1, 0.2, 0.3]), np.array([1.0, 0.0, 0.5]))
     arguments = {
@@ -264,10 +281,10 @@ def test_the_way_through_the_cameras_is_compared_with_the_spheres(bench: Bench, 
             }
         ],
     }
-    done = HANDLERS["fuse"](JobContext(arguments, bench.store, tmp_path, lambda *_: None))
+    done = HANDLERS["fuse"](JobContext(arguments, fused_run.store, tmp_path, lambda *_: None))
     assert done.measures["loop_closure_mm"] == pytest.approx(0.2, abs=0.03)
     assert done.measures["loop_closure_rms_mm"] == pytest.approx(0.2, abs=0.03)
-    columns, _ = read_ply(bench.store.artefact_path(done.artefacts[0].sha256))
+    columns, _ = read_ply(fused_run.store.artefact_path(done.artefacts[0].sha256))
     x, y, z = (np.asarray(columns[axis], dtype=np.float64) for axis in "xyz")
     middle = (np.hypot(x + 16, y - 14.5) < 1.5) & (z > 25)
     assert middle.any()
@@ -276,17 +293,16 @@ def test_the_way_through_the_cameras_is_compared_with_the_spheres(bench: Bench, 
 
 @pytest.mark.slow
 def test_the_meshes_of_a_simulated_run_say_so_and_those_of_earlier_versions_are_as_they_were(
-    bench: Bench, tmp_path: Path
+    fused_run: Bench, tmp_path: Path
 ) -> None:
-    fused(bench)
-    steps = bench.state().steps
+    steps = fused_run.state().steps
     (job,) = (j for j in steps["ground_truth"].jobs.values() if j.kind == "fuse")
     earlier = {**job.arguments, "ct": dict(steps["ct"].result), "scan": dict(steps["scan"].result)}
     assert earlier.pop("simulated") is True
-    before = HANDLERS["fuse"](JobContext(earlier, bench.store, tmp_path, lambda *_: None))
+    before = HANDLERS["fuse"](JobContext(earlier, fused_run.store, tmp_path, lambda *_: None))
     line = b"comment " + SIMULATED.encode("ascii") + b"\n"
     files = [
-        [bench.store.artefact_path(ref.sha256).read_bytes() for ref in refs if ref.media_type == "model/ply"]
+        [fused_run.store.artefact_path(ref.sha256).read_bytes() for ref in refs if ref.media_type == "model/ply"]
         for refs in (job.artefacts, before.artefacts)
     ]
     assert [len(each) for each in files] == [2, 2]

@@ -26,7 +26,7 @@ from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
 from simulators.still_camera.raw_file import encode_raw
 from tests.support.scenes.scene_photographs import pose_above
 
-WIDTH = 1200
+WIDTH = 900
 SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100)
 
 
@@ -45,7 +45,7 @@ def centre_errors_px(outlines: list[dict[str, Any]], T_camera_world: Array, scen
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_processor")
 def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path) -> None:
-    scene = Scene.generate(5)
+    scene = Scene.generate(7)
     lens = scene.camera_intrinsics(WIDTH)
     camera = CameraModel.from_record(lens.to_json())
     renderer = Renderer(WIDTH)
@@ -92,7 +92,7 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             found[where] = JobContext({}, store, tmp_path, lambda *_: None).input_json(done.artefacts[0].sha256)
             assert done.measures["outlines"] == sum(map(len, found[where].values())) >= 16
         smaller = {"images": views[:1], "camera": asdict(camera.scaled(600, 400)), "reduced_to": [600, 400]}
-        with pytest.raises(DataError, match=r"1200×800 pixels.*JPEG's size"):
+        with pytest.raises(DataError, match=r"900×600 pixels.*JPEG's size"):
             run("detect_spheres", **search | smaller, developed=developed)
     errors = {
         where: np.concatenate([

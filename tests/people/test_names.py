@@ -155,6 +155,7 @@ def test_every_name_at_every_place_where_there_are_accounts(site: NamedSite, pla
     refused_at(site, place, (*NAMES, *HER_OWN, *PEOPLE))
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("place", at_places())
 def test_every_name_at_every_place_where_there_are_none(without: NamedSite, place: str) -> None:

@@ -116,6 +116,11 @@ def test_images_without_a_pose_are_left_out_by_name(photographs: BoardFolder, tm
     done = _invoke(*_commands(fewer, tmp_path)["hand-eye"])
     assert done.exit_code == 0, done.output
     assert "b0.jpg: no pose in poses.csv" in done.output
+    images = tmp_path / "images"  # as many as it takes: all are searched for spheres
+    images.mkdir()
+    for name in ("b0.jpg", "b1.jpg", "b2.jpg"):
+        shutil.copy(photographs.images / name, images)
+    fewer = BoardFolder(images, photographs.camera, {name: T[name] for name in ("b1.jpg", "b2.jpg")})
     done = _invoke(*_commands(fewer, tmp_path)["register"])
     assert "left out b0.jpg: no pose in poses.csv" in done.output
     done = _invoke(*_commands(fewer, tmp_path)["register"], "--strict")

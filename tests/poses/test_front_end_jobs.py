@@ -16,7 +16,7 @@ from service.core.records.events import ArtefactRef
 from service.worker.loop import HANDLERS
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
-WIDTH_PX = 480
+WIDTH_PX = 360
 EFFORT: dict[str, Any] = {"max_image_size": WIDTH_PX, "max_features": 800, "neighbours": 3}
 
 

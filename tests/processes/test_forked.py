@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -18,7 +19,7 @@ import pytest
 from drivers.host.doing import Note
 from tests.support.processes.forked import INSTALLED, ROOT, SET_BY_IMPORTS, Forked
 from tests.support.processes.waiting import until
-from tests.support.rig.rig import command
+from tests.support.rig.rig import command, simulated_rig
 
 PROBE = (sys.executable, "-m", "tests.support.processes.probe")
 
@@ -178,6 +179,28 @@ def test_the_devices_of_a_forked_rig_are_forks_too_and_end_with_it(tmp_path: Pat
         assert rig.wait(60) == (0 if how == signal.SIGTERM else -how)
         until(lambda: not any(process.is_running() for process in below), "its processes have not ended")
     assert not (tmp_path / "lightbox").is_symlink()  # the light box ended in order
+
+
+@pytest.mark.slow
+def test_the_drivers_of_a_forked_command_are_forks_too(tmp_path: Path) -> None:
+    """They were real starts for long, since each command silences OpenCV by a variable of the environment."""
+    seen: dict[int, list[str]] = {}
+    options = ("--scene", "3", "--image-width", "300", "--hand", "steady")
+    with (
+        simulated_rig(tmp_path, *options, host="127.0.0.76") as ready,
+        Forked(command("doctor", "--rig", ready["rig"]), cwd=ROOT, stdout=subprocess.DEVNULL) as doctor,
+    ):
+
+        def has_ended() -> bool:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                for process in psutil.Process(doctor.pid).children(recursive=True):
+                    seen[process.pid] = process.cmdline()[1:3]
+            return doctor.poll() is not None
+
+        until(has_ended, "the doctor has not ended")
+        assert doctor.returncode == 0
+    assert len(seen) >= 2  # its zygote and the camera's driver
+    assert [line for line in seen.values() if line not in ([], ["-m", "tests.support.processes.zygote"])] == []
 
 
 @pytest.mark.parametrize("kind", [Forked, subprocess.Popen])

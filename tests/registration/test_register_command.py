@@ -33,7 +33,7 @@ from tests.support.scenes.scene_photographs import photograph, pose_above
 
 Array = NDArray[np.float64]
 
-WIDTH, N_IMAGES, SEED = 720, 6, 7
+WIDTH, N_IMAGES, SEED = 576, 6, 7
 KEYS = {
     "T_world_scan", "scale", "covariance", "rms_px", "mean_radial_error_mm", "mean_reprojection_error_px", "n_images",
     "markers", "images",
@@ -71,7 +71,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
         for i in range(N_IMAGES)
     }
     photograph(scene, poses, WIDTH, folder / "images")
-    scan = scan_scene(scene, spray=True, control_spheres=True, spacing_m=1.2e-3)
+    scan = scan_scene(scene, spray=True, control_spheres=True, spacing_m=1.6e-3)
     (_, data), *_ = encode("ply", "scan.ply", 1e3 * scan.vertices_m, scan.faces, scan.normals)
     (folder / "scan.ply").write_bytes(data)
     T_scan_world = inverse(scan.T_world_scan)
@@ -99,7 +99,7 @@ def few(capture: Capture, tmp_path: Path, one_processor: None) -> Path:
 def record(capture: Capture) -> dict[str, Any]:
     """The result of registering all photographs, with spheres.json and CSV."""
     out = capture.folder / "result.json"
-    result = register(capture, out)
+    result = register(capture, out, workers=1)  # to start more takes longer than what they do
     assert f"{N_IMAGES} images" in result.output
     assert "written:" in result.output
     return registered(result, out)
@@ -143,7 +143,6 @@ def true_error_mm(record: dict[str, Any], capture: Capture) -> float:
 # --- what it computes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_spheres_and_csv(capture: Capture, record: dict[str, Any]) -> None:
     assert true_error_mm(record, capture) < 0.1
     assert record["scale"] == 1.0
@@ -167,7 +166,6 @@ def test_its_limits_of_control_spheres_are_the_gates_of_the_shipped_protocol(rec
     assert [own[measure] for measure in both] == [limits[measure] for measure in both]
 
 
-@pytest.mark.slow
 def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, record: dict[str, Any]) -> None:
     assert [entry["image"] for entry in record["images"]] == sorted(capture.T_world_camera)
     seen = 0
@@ -187,20 +185,20 @@ def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, rec
 
 
 @pytest.mark.slow
-def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
+def test_mesh_and_control_indices(capture: Capture, few: Path, tmp_path: Path) -> None:
     out = tmp_path / "result.json"
     mesh: dict[str, object] = {
         "spheres": None,
         "mesh": capture.mesh,
         "radius_mm": 15,
         "mesh_unit": "mm",
-        "workers": 1,  # to start more takes longer than what they do
+        "images": few,
     }
     record = registered(register(capture, out, **mesh), out)
     assert record["mean_radial_error_mm"] is None
     centres = np.array(record["spheres_mm"]["registration"])
     assert len(centres) == 13
-    assert true_error_mm(record, capture) < 0.1
+    assert true_error_mm(record, capture) < 0.15
     # The user reads the indices from this list and runs again.
     gaps = np.linalg.norm(centres[:, None] - 1e3 * capture.control_scan_m, axis=2)
     control = gaps.argmin(axis=0)
@@ -208,7 +206,7 @@ def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
     record = registered(register(capture, out, **mesh, control=",".join(map(str, control))), out)
     assert len(record["spheres_mm"]["registration"]) == 10
     assert np.allclose(record["spheres_mm"]["control"], centres[sorted(control)])
-    assert true_error_mm(record, capture) < 0.1
+    assert true_error_mm(record, capture) < 0.15
     assert record["mean_radial_error_mm"] < 0.2
 
 
@@ -309,7 +307,7 @@ def test_photographs_of_another_size_than_the_calibrated(capture: Capture, few: 
         assert picture is not None
         cv2.imwrite(str(file), picture[:-40])
     out = tmp_path / "result.json"
-    refused(register(capture, out, images=few), out, f"{WIDTH} × 440 px", "camera model is for")
+    refused(register(capture, out, images=few), out, f"{WIDTH} × 344 px", "camera model is for")
 
 
 @pytest.mark.slow

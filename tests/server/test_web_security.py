@@ -136,7 +136,6 @@ def test_names_and_addresses_that_it_has(site: WebSite, host: str) -> None:
 FIRST = ("../../../../etc/passwd", "<script>alert(1)</script>", "\r\nSet-Cookie: a=b")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "hostile", [pytest.param(hostile, marks=pytest.mark.sweep(always=hostile in FIRST)) for hostile in HOSTILE]
 )

@@ -78,7 +78,6 @@ def test_a_design_covers_the_image_and_predicts_what_its_images_come_to() -> Non
     assert prediction.uncertainty_mm < by_chance.uncertainty_mm
 
 
-@pytest.mark.slow
 def test_what_the_arm_cannot_take_is_not_planned_and_enough_is_enough() -> None:
     known = nominal(SMALL)
     candidates = board_candidates(known, BOARD, ViewRange(), APPROACH)

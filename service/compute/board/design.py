@@ -109,12 +109,11 @@ class _ToleranceDraws:
 
     def pixels(self, T_base_camera: Array) -> tuple[Array, Array]:
         """Return (C, D, K, 2) pixels of the outline and (C, D, K) its depths, m."""
-        R = T_base_camera[:, :3, :3]
-        moved = self.outline_base[None] - T_base_camera[:, None, None, :3, 3]
-        sent = np.einsum("cji,cdkj->cdki", R, moved)
-        turned = (
-            np.einsum("dij,cdkj->cdki", self.T_true_sent[:, :3, :3], sent) + self.T_true_sent[None, :, None, :3, 3]
-        )
+        count, (draws, points, _) = len(T_base_camera), self.outline_base.shape
+        moved = self.outline_base.reshape(-1, 3) - T_base_camera[:, None, :3, 3]
+        sent = (moved @ T_base_camera[:, :3, :3]).reshape(count, draws, points, 3)
+        T = self.T_true_sent
+        turned = sent @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
         pixels = self.camera.project(turned.reshape(-1, 3)).reshape(*turned.shape[:3], 2)
         middle = np.array([self.camera.cx, self.camera.cy])
         return (pixels - middle) * self.zoom[:, None, None] + middle + self.shift_px[:, None], turned[..., 2]
@@ -126,15 +125,21 @@ def _grid(known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Arra
     towards = approach - (approach @ normal) * normal
     towards /= np.linalg.norm(towards)
     side = np.cross(normal, towards)
+    rolls = [_roll(angle) for angle in np.radians(wishes.rolls_deg)]
     poses: list[Transform] = []
     for tilt in np.radians(wishes.tilts_deg):
         for azimuth in np.arange(wishes.azimuths if tilt > 0 else 1) * 2 * np.pi / wishes.azimuths:
             out = np.cos(tilt) * normal + np.sin(tilt) * (np.cos(azimuth) * towards + np.sin(azimuth) * side)
-            for distance, roll in product(wishes.distances_m, np.radians(wishes.rolls_deg)):
-                c, s = np.cos(roll), np.sin(roll)
-                about = transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-                poses.append(look_at(middle + distance * out, middle, -towards) @ about)
+            for distance in wishes.distances_m:
+                upright = look_at(middle + distance * out, middle, -towards)
+                poses += [upright @ about for about in rolls]
     return poses
+
+
+def _roll(angle_rad: float) -> Transform:
+    """Return the rotation about the optical axis."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
 
 def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _ToleranceDraws) -> Array:

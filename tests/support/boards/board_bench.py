@@ -18,7 +18,7 @@ from tests.support.runs.bench_run import Bench
 from tests.support.runs.computing_run import compute_jobs
 
 BOARD = Board(7, 10, 0.030)
-LENS = CameraModel(900, 600, 1272.0, 1272.5, 452.0, 297.0, -0.05, 0.02, 2e-4, -2e-4)
+LENS = CameraModel(600, 400, 848.0, 848.5, 301.5, 198.0, -0.05, 0.02, 2e-4, -2e-4)
 MOUNT = transform(Rotation.from_rotvec([0.006, -0.008, 0.009]), np.array([0.0012, -0.0009, 0.1008]))  # drawn: 0 0 0.1
 
 Picture = NDArray[np.uint8]

@@ -138,8 +138,11 @@ def _tile(
     # x and y are each contiguous and of single precision (a ten-thousandth of a pixel), which takes half the time.
     xy = np.moveaxis(np.stack([wy @ values[:, :, k] @ wx.T for k in range(2)]).astype(np.float32), 0, -1)
     footprint_m = float(np.sqrt(np.abs(np.linalg.det([xy[1, 0] - xy[0, 0], xy[0, 1] - xy[0, 0]]))))
-    grey = shade(np.moveaxis(xy, -1, 0).reshape(2, -1).T, footprint_m).reshape(height, samples, width, samples)
-    return grey.mean(axis=(1, 3)).astype(np.float32)
+    grey = shade(np.moveaxis(xy, -1, 0).reshape(2, -1).T, footprint_m).reshape(height * samples, width * samples)
+    # The mean of whole areas, in a third of the time that `mean` over two axes takes.
+    return np.asarray(
+        cv2.resize(grey.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
+    )
 
 
 def _lagrange(nodes: Array, at: Array) -> Array:

@@ -19,9 +19,10 @@ import psutil
 from service.machine.executors import computing_at
 from service.machine.schedulers import Scheduler
 from tests.support.processes.waiting import until
+from tests.support.processes.zygote import CLUSTER
 from tests.support.rig.rig import REPOSITORY
 
-_SCHEDULER, _WORKER = "distributed.cli.dask_scheduler", "distributed.cli.dask_worker"
+_SCHEDULER, _WORKER = CLUSTER
 
 
 @dataclass
@@ -32,6 +33,7 @@ class Cluster:
     folder: Path
     options: Sequence[str]
     scheduler: subprocess.Popen[bytes]
+    start: type[subprocess.Popen[bytes]]
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list[subprocess.Popen[bytes]])
 
     def add_worker(self, environment: Mapping[str, str] | None = None, *options: str) -> subprocess.Popen[bytes]:
@@ -39,26 +41,36 @@ class Cluster:
         name = f"worker{len(self.workers)}"
         one = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder))
         log = self.folder / f"{name}.log"
-        worker = _start([_WORKER, self.address, *one, *self.options, *options], log, environment or {})
+        worker = _start(self.start, [_WORKER, self.address, *one, *self.options, *options], log, environment or {})
         self.workers.append(worker)
         return worker
 
 
 @contextmanager
 def dask_cluster(
-    folder: Path, *, workers: int = 2, options: Sequence[str] = (), scheme: str = "tcp"
+    folder: Path,
+    *,
+    workers: int = 2,
+    nannies: bool = True,
+    options: Sequence[str] = (),
+    scheme: str = "tcp",
+    start: type[subprocess.Popen[bytes]] = subprocess.Popen,
 ) -> Generator[Cluster]:
-    """Start a scheduler and workers; end them after the block. `options` are given to each, such as files for tls."""
+    """Start a scheduler and workers; end them after the block.
+
+    `nannies`: whether these workers are started again when they die. `options` are given to each, such as files for
+    tls. With `start=Forked`, they are forks of the zygote.
+    """
     where = folder / "scheduler.json"
     ports = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(where))
     security = ("--protocol", scheme, *options)
-    scheduler = _start([_SCHEDULER, *ports, *security], folder / "scheduler.log", {})
-    cluster = Cluster("", folder, security, scheduler)
+    scheduler = _start(start, [_SCHEDULER, *ports, *security], folder / "scheduler.log", {})
+    cluster = Cluster("", folder, security, scheduler, start)
     try:
         until(lambda: bool(_address(where)), lambda: (folder / "scheduler.log").read_text(encoding="utf-8"))
         cluster.address = _address(where)
         for _ in range(workers):
-            cluster.add_worker()
+            cluster.add_worker(None, *(() if nannies else ("--no-nanny",)))
         yield cluster
     finally:
         for process in [scheduler, *cluster.workers]:
@@ -82,10 +94,12 @@ def end_tree(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _start(options: Sequence[str], log: Path, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+def _start(
+    start: type[subprocess.Popen[bytes]], options: Sequence[str], log: Path, environment: Mapping[str, str]
+) -> subprocess.Popen[bytes]:
     own = {**os.environ, "PYTHONPATH": str(REPOSITORY), **environment}
     with log.open("wb") as output:
-        return subprocess.Popen(
+        return start(
             [sys.executable, "-m", *options], cwd=log.parent, env=own,
             stdin=subprocess.DEVNULL, stdout=output, stderr=output,
         )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import time
 from pathlib import Path
 
 from service.core.errors import DataError
@@ -27,7 +28,7 @@ def _crash(data: bytes, _: Path) -> None:
 
 def _hang(data: bytes, _: Path) -> None:
     while _spoilt(data):
-        pass
+        time.sleep(0.01)  # only the clock tells this from an endless computation
 
 
 def _grow(data: bytes, _: Path) -> None:

@@ -1,11 +1,11 @@
 """Starts processes of the program for tests without importing everything again: by forks of a zygote.
 
 `Forked` and `run` stand for `subprocess.Popen` and `subprocess.run`. What is forked: `orthocapture …`,
-`python -m service.cli.main …`, `python -m simulators …`, `python -m drivers.host …`, some programs of the tests
-(OF_TESTS); the devices that a forked rig starts; the drivers, workers and runners that a forked command starts; and
-what the pages of a site in this process start for exports, previews and verifications (OF_PAGES, by `pages_fork`).
-Everything else is a real start, as are these where the environment differs in a variable that something may read
-while it starts.
+`python -m service.cli.main …`, `python -m simulators …`, `python -m drivers.host …`, some programs of the tests and
+those of a Dask cluster (OF_TESTS); the devices that a forked rig starts; the drivers, workers and runners that a
+forked command starts; and what the pages of a site in this process start for exports, previews and verifications
+(OF_PAGES, by `pages_fork`). Everything else is a real start, as are these where the environment differs in a variable
+that something may read while it starts.
 
 What is about starting itself is a real start too, by `subprocess`: tests/cli/test_start_up.py, the installed command
 in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So are
@@ -41,7 +41,8 @@ _MODULES = (COMMANDS, SIMULATORS, HOST, *OF_PAGES, *OF_TESTS)
 # (cv2, gdcm, gphoto2, torch), and by drivers that tests use in their own process.
 SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
 _READ_LATER = ("ORTHOCAPTURE_", "PYTEST_", "GENTL_CAMERA", "OPENCV_FFMPEG_", "XDG_CONFIG_HOME", *SET_BY_IMPORTS)
-_DONE_BY_ZYGOTE = ("PYTHONPATH", "PYTHONUNBUFFERED")  # it does what the interpreter would with these
+# What the zygote does in the place of the interpreter, and of OpenCV: each command silences that for what it starts.
+_DONE_BY_ZYGOTE = ("PYTHONPATH", "PYTHONUNBUFFERED", "OPENCV_LOG_LEVEL")
 _ENVIRONMENT = dict(os.environ)  # before any test has changed it
 _NUMBER_BYTES = 8
 _PARENT = "--parent"

@@ -48,7 +48,8 @@ OF_PAGES = {
 VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
     "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",
 ))  # fmt: skip
-OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", *VENDORS)
+CLUSTER = ("distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
+OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", *VENDORS, *CLUSTER)
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
 _statuses: list[int] = []  # of this process, if it is a fork that has come to its end
@@ -233,6 +234,9 @@ def _become(request: _Request, descriptors: tuple[int, ...], before: dict[str, s
     sys.path[:] = [os.path.dirname(request.script) or request.cwd, *_listed(request.env), *others]
     sys.argv = [request.script or request.main, *request.words]
     _open_standard_streams(unbuffered=bool(request.env.get("PYTHONUNBUFFERED")))
+    if "cv2" in sys.modules and request.env.get("OPENCV_LOG_LEVEL") == "SILENT":
+        logging = sys.modules["cv2"].utils.logging
+        logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed()  # Python's own was seeded anew by fork
     if "multiprocessing.process" in sys.modules:
@@ -295,8 +299,17 @@ def _below(zygote: _Zygote, asked: _Request) -> tuple[_Request | None, bool]:
     theirs.close()
     forked: Any = importlib.import_module("tests.support.processes.forked")
     forked.use(ours, pid)
-    subprocess.Popen = forked.Forked  # pyright: ignore[reportAttributeAccessIssue]
+    _use_forks(forked.Forked)
     return asked, False
+
+
+def _use_forks(forked: type[subprocess.Popen[Any]]) -> None:
+    """Let this process start others by forks, also by modules that have imported `Popen` already."""
+    started = subprocess.Popen
+    subprocess.Popen = forked  # pyright: ignore[reportAttributeAccessIssue]
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] in ("service", "drivers", "simulators") and vars(module).get("Popen") is started:
+            vars(module)["Popen"] = forked
 
 
 def _leave_at_once() -> None:

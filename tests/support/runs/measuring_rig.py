@@ -57,8 +57,8 @@ def hill() -> tuple[Array, Any]:
     board = trimesh.creation.box(
         (0.7, 0.5, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, -0.01))
     )
-    board = board.subdivide_to_size(0.02)
-    ball = trimesh.creation.icosphere(4, 0.06)
+    board = board.subdivide_to_size(0.04)
+    ball = trimesh.creation.icosphere(3, 0.06)
     whole = trimesh.util.concatenate([board, ball])
     assert isinstance(whole, trimesh.Trimesh)
     return np.asarray(whole.vertices, dtype=np.float64), np.asarray(whole.faces, dtype=np.int32)
