@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -178,7 +178,7 @@ def plain_payload(payload: str) -> Any:
 
 def columns_of(payload: Any) -> dict[str, str | None]:
     """Return step and device of a payload; None for what it does not name."""
-    named = payload if isinstance(payload, Mapping) else {}
+    named: dict[str, Any] = payload if isinstance(payload, dict) else {}
     found = {name: named.get(name) for name in ("step", "device")}
     return {name: value if isinstance(value, str) else None for name, value in found.items()}
 
@@ -186,11 +186,12 @@ def columns_of(payload: Any) -> dict[str, str | None]:
 def facets_of(payload: Any) -> list[tuple[str, str]]:
     """Return name and value of the facets of a payload, sorted by name."""
     found: list[tuple[str, str]] = []
-    for name, path in FACETS.items():
-        value = payload
-        for part in path:
-            value = value.get(part) if isinstance(value, Mapping) else None
-        if isinstance(value, str | int | float):
+    named: dict[str, Any] = payload if isinstance(payload, dict) else {}
+    for name, (first, *others) in FACETS.items():
+        value = named.get(first)
+        for part in others:
+            value = value.get(part) if isinstance(value, dict) else None
+        if value is not None and isinstance(value, str | int | float):
             found.append((name, facet_value(value)))
     return found
 
@@ -208,18 +209,20 @@ def words_of(actor: str, payload: Any) -> str:
 
     Numbers and names of fields are not searched for.
     """
-    return " ".join(word for said in (actor, *_texts(payload)) for word in cut_words(said))
+    texts = [actor]
+    _add_texts([payload], texts)
+    return " ".join(cut_words(" ".join(texts)))
 
 
-def _texts(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _texts(item)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _texts(item)
+def _add_texts(items: Iterable[Any], found: list[str]) -> None:
+    """Append all texts among the items, and in what they hold, in their order."""
+    for item in items:
+        if isinstance(item, str):
+            found.append(item)
+        elif isinstance(item, dict):
+            _add_texts(item.values(), found)
+        elif isinstance(item, list):
+            _add_texts(item, found)
 
 
 def cut_words(said: str) -> list[str]:

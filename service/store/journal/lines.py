@@ -23,6 +23,7 @@ UNREADABLE = "it cannot be read"
 FIRST = "0" * 64  # stands for the line before the first
 Value = str | int | float | None
 Word = Literal["committed", "withdrawn"]
+_VALUE_TYPES = frozenset({str, int, float, bool, type(None)})  # what JSON has besides lists and objects
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 
 
@@ -132,7 +133,7 @@ def parse_line(raw: bytes, end: int) -> JournalLine:
 def _row(item: Any) -> RowImage:
     gone = "gone" in item
     values = cast("dict[str, object]", item["gone" if gone else "row"])
-    if any(not isinstance(value, str | int | float | None) for value in values.values()):
+    if not _VALUE_TYPES.issuperset(map(type, values.values())):
         raise TypeError("a column is of another kind")
     return RowImage(str(item["table"]), cast("dict[str, Value]", values), gone)
 
