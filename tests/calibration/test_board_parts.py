@@ -62,12 +62,14 @@ def test_corners_are_not_named_where_half_a_square_is_in_doubt() -> None:
 def test_a_board_that_is_covered_in_part_counts_by_what_is_seen() -> None:
     T = camera_pose((0.0, 0.0))
     image, truth = taken_from(T)
-    image[:, :420] = 60
-    found = with_parts([BoardImage((900, 600), None, "no board")], [image], BOARD, KNOWN, T[None])
-    (one,) = found
+    image[:, :280] = 60
+    unseen = BoardImage((LENS.width, LENS.height), None, "no board")
+    (one,) = with_parts([unseen], [image], BOARD, KNOWN, T[None])
     assert one.view is not None
-    assert one.view.corners[:, 0].min() > 420
+    assert one.view.corners[:, 0].min() > 280
     assert np.linalg.norm(one.view.corners - truth[one.view.indices], axis=1).max() < 0.2
-    (none,) = with_parts([BoardImage((900, 600), None, "no board")], [np.zeros_like(image)], BOARD, KNOWN, T[None])
+    (none,) = with_parts(
+        [BoardImage((LENS.width, LENS.height), None, "no board")], [np.zeros_like(image)], BOARD, KNOWN, T[None]
+    )
     assert none.view is None
     assert none.reason.startswith("no board; in part: only")
