@@ -265,8 +265,14 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         expect(go).to_be_enabled()
 
         # The foot pedal acts like the button: one press arms, two move the robot.
-        press_pedal(rig["world"])
-        expect(second.page.get_by_text("Foot pedal pressed once").first).to_be_visible(timeout=LONG_MS)
+        armed = second.page.get_by_text("Foot pedal pressed once").first
+        for _ in range(20):  # a press that this machine reads too late counts for nothing
+            press_pedal(rig["world"])
+            with contextlib.suppress(AssertionError):
+                expect(armed).to_be_visible(timeout=LONG_MS / 6)
+                break
+        else:
+            pytest.fail("no press arms the pedal")
         working = second.page.get_by_text("Working").first
         for _ in range(20):  # a press that this machine reads too late is a first one again
             second.page.wait_for_timeout(800)  # a shorter pause would be a bounce

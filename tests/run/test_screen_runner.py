@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,18 @@ class Watched:
         return (state.current, state.phase) == (step, phase)
 
 
+def press_until(condition: Callable[[], bool], watched: Watched, world: str, what: str) -> None:
+    """Press the pedal, and again only if nothing came of it: one that a busy machine reads late does not count."""
+
+    def pressed() -> bool:
+        before_utc_s = watched.told.at_utc_s
+        press_pedal(world)
+        until(lambda: condition() or watched.told.at_utc_s > before_utc_s + 10.0, what)
+        return condition()
+
+    until(lambda: condition() or pressed(), what)
+
+
 def pressed_twice(watched: Watched, world: str) -> bool:
     """Press the pedal twice, a second apart, while the run waits for it; never says that this was enough."""
 
@@ -104,12 +117,11 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
         assert Launcher(data, store).driven(run_id)
 
         # The pedal acts as the screen's button: with open items it is refused, which is recorded.
-        press_pedal(ready["world"])
-        until(lambda: len(watched.state().deviations) == 1, "the refusal is recorded")
+        press_until(lambda: bool(watched.state().deviations), watched, ready["world"], "the refusal is recorded")
         assert "not ticked" in watched.state().deviations[0].text
         watched.tick_all()
-        press_pedal(ready["world"])
-        until(lambda: watched.at("viewpoint_capture_1", "ready"), "the pedal confirmed")
+        confirmed = "the pedal confirmed"
+        press_until(lambda: watched.at("viewpoint_capture_1", "ready"), watched, ready["world"], confirmed)
 
         ask_for_frames(data, run_id)
         until(lambda: frame_path(data, run_id).exists() or bool(ask_for_frames(data, run_id)), "a live view frame")
