@@ -380,6 +380,13 @@ def test_a_folder_that_does_not_sign_compares_the_ends_of_chains_and_says_what_i
         assert (report.anchors.lines, report.anchors.roots, report.anchors.heads) == (0, 1, 2)
         assert report.anchors.lines_not_compared == len(site.lines())
         assert f"the log of signatures is in {first} on " in report.not_compared[0]
+        away = Site(second, objects, weed)
+        reached = yaml.safe_load((second / "site.yaml").read_text())["object_store"]["endpoint"]
+        away.section(endpoint="http://127.0.0.1:9")
+        counts = verify(second).anchors
+        assert counts is not None
+        assert (counts.lines_not_compared, counts.heads_not_compared) == (len(site.lines()), 2)
+        away.section(endpoint=reached)
         cluster.run(
             database,
             "ALTER TABLE events DISABLE TRIGGER ALL",

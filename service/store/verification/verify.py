@@ -292,15 +292,15 @@ def _anchor_findings(
     anchors, lines = outside.anchors, outside.lines or []
     if anchors is None:
         return AnchorFindings(), ()
+    signed = sum(map(len, evidence.checkpoints.values())) if elsewhere else len(lines)
     if isinstance(anchors, UnreadAnchors):
-        counts = AnchorCounts(lines_not_compared=len(lines), heads_not_compared=len(evidence.heads))
+        counts = AnchorCounts(lines_not_compared=signed, heads_not_compared=len(evidence.heads))
         said = not_compared(anchors.place, anchors.why, counts.lines_not_compared, counts.heads_not_compared)
         return AnchorFindings(counts=counts), (said,)
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
     if not elsewhere:
         return compare(anchors, RecordSide(lines, chains, public_keys, every_run)), ()
     found = compare(anchors, RecordSide(None, chains, public_keys, every_run))
-    signed = sum(map(len, evidence.checkpoints.values()))
     found.counts = replace(found.counts, lines_not_compared=signed)
     return found, (lines_not_compared(anchors.place, elsewhere, signed),)
 
