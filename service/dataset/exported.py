@@ -19,6 +19,7 @@ from service.core.errors import DataError
 from service.core.text.files import parse_json
 from service.dataset.export_folder import SUMS, check_folder
 from service.dataset.formats.meshes import png
+from service.dataset.pixels import PixelsOfAnother
 from service.dataset.records import DataSet, Mesh, PosedView
 
 INDEX = "data.h5"
@@ -91,29 +92,15 @@ def lossless_data_set(dataset: DataSet) -> DataSet:
     return dataclasses.replace(dataset, views=views, pixels=_Lossless(dataset))
 
 
-class _Lossless:
+class _Lossless(PixelsOfAnother):
     """The views of a data set with their pictures as PNG, in the place of the camera's own files."""
 
     def __init__(self, photographed: DataSet) -> None:
-        self._inner, self._mark = photographed.pixels, photographed.mark
+        super().__init__(photographed.pixels)
+        self._mark = photographed.mark
 
     def picture(self, view: PosedView) -> bytes:
         return png(self.colours(view), self._mark)
-
-    def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        return self._inner.colours(view)
-
-    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        return self._inner.depth_m(view)
-
-    def normal(self, view: PosedView) -> NDArray[np.float32]:
-        return self._inner.normal(view)
-
-    def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        return self._inner.valid(view)
-
-    def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        return self._inner.markers(view)
 
 
 def scaled_data_set(dataset: DataSet, width: int) -> DataSet:

@@ -18,7 +18,7 @@ from service.compute.pixels.render import RayMesh, depth_map, seen
 from service.compute.pixels.resample import pinhole_of, undistorted, valid_pixels
 from service.compute.pixels.views import FULL_HD, ImageCrop, Splits, marker_free_crops
 from service.core.errors import DataError
-from service.dataset.records import DataSet, PosedView
+from service.dataset.records import DataSet, Pixels, PosedView
 
 _T = TypeVar("_T")
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
@@ -106,13 +106,48 @@ class Photographs:
         return marker_mask(view.camera, view.T_world_camera, self._spheres, self._posts)
 
 
-class UndistortedViews:
-    """The views of a data set as pinhole cameras: `undistorted_data_set` makes them."""
+class PixelsOfAnother:
+    """The pixels of another data set as they are: a base of pixels that differ in some respects."""
+
+    def __init__(self, inner: Pixels) -> None:
+        """Take the other data set's pixels."""
+        self._inner = inner
+
+    def picture(self, view: PosedView) -> bytes:
+        """Return the picture's file."""
+        return self._inner.picture(view)
+
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
+        """Return the colours (H, W, 3), BGR."""
+        return self._inner.colours(view)
+
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
+        """Return the depth (H, W), z of the mesh."""
+        return self._inner.depth_m(view)
+
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
+        """Return the normals (H, W, 3) of the mesh."""
+        return self._inner.normal(view)
+
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
+        """Return which pixels the photograph has, (H, W)."""
+        return self._inner.valid(view)
+
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
+        """Return which pixels (H, W) show a sphere or a post."""
+        return self._inner.markers(view)
+
+
+class UndistortedViews(PixelsOfAnother):
+    """The views of a data set as pinhole cameras: `undistorted_data_set` makes them.
+
+    Depth, normals and markers are computed for the camera of each view, and so for the pinhole.
+    """
 
     def __init__(self, distorted: DataSet, *, personal: bool) -> None:
         """Resample the views of `distorted`; they keep their names."""
-        self._sources, self._inner = {view.name: view for view in distorted.views}, distorted.pixels
-        self._personal = personal
+        super().__init__(distorted.pixels)
+        self._sources, self._personal = {view.name: view for view in distorted.views}, personal
         self._colours = _Last(self._resampled)
 
     def picture(self, view: PosedView) -> bytes:
@@ -127,29 +162,18 @@ class UndistortedViews:
         source = self._sources[view.name]
         return undistorted(self._inner.colours(source), source.camera).image
 
-    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """Return the depth (H, W), z of the mesh for the pinhole."""
-        return self._inner.depth_m(view)
-
-    def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """Return the normals (H, W, 3) for the pinhole."""
-        return self._inner.normal(view)
-
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """Return which pixels the photograph has, (H, W)."""
         return valid_pixels(self._sources[view.name].camera)
 
-    def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Return which pixels show a sphere or a post in the pinhole's picture, (H, W)."""
-        return self._inner.markers(view)
 
-
-class Cropped:
-    """Parts of the views of a data set: `cropped_data_set` makes them."""
+class Cropped(PixelsOfAnother):
+    """Parts of the views of a data set, without markers: `cropped_data_set` makes them."""
 
     def __init__(self, whole: DataSet, crops: Mapping[str, tuple[PosedView, ImageCrop]], *, personal: bool) -> None:
         """Take the whole data set, and for each new view its source and its place there."""
-        self._inner, self._crops, self._personal = whole.pixels, crops, personal
+        super().__init__(whole.pixels)
+        self._crops, self._personal = crops, personal
         self._originals = _Last(whole.pixels.picture)
 
     def picture(self, view: PosedView) -> bytes:
@@ -162,22 +186,10 @@ class Cropped:
         source, crop = self._crops[view.name]
         return np.ascontiguousarray(self._inner.colours(source)[crop.slices])
 
-    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        """Return the depth (H, W), z of the mesh."""
-        return self._inner.depth_m(view)
-
-    def normal(self, view: PosedView) -> NDArray[np.float32]:
-        """Return the normals (H, W, 3) of the mesh."""
-        return self._inner.normal(view)
-
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """Return which pixels the source has, (H, W)."""
         source, crop = self._crops[view.name]
         return self._inner.valid(source)[crop.slices]
-
-    def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Return which pixels (H, W) show a marker; none does, as crops are chosen so."""
-        return self._inner.markers(view)
 
 
 def undistorted_data_set(dataset: DataSet, *, personal: bool = True) -> DataSet:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, cast
 
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
@@ -134,7 +134,7 @@ class JobChoice:
     kinds: Collection[str] | None
     run_id: str | None
     lane: Lane | None
-    able: Able = field(default_factory=dict[str, Any])
+    able: Able
 
     def condition(self) -> ColumnElement[bool]:
         """Return the choice as a condition on the rows of `jobs`."""

@@ -16,7 +16,7 @@ from service.compute.pixels.masks import hull_mask
 from service.core.errors import ConfigurationError, DataError
 from service.dataset.export_folder import ExportFolder, export_folder
 from service.dataset.exporter import exporter, exporters, write_data_set
-from service.dataset.pixels import cropped_data_set, undistorted_data_set
+from service.dataset.pixels import PixelsOfAnother, cropped_data_set, undistorted_data_set
 from service.dataset.records import DataSet, Pixels, PosedView
 from tests.support.scenes.posed import posed_data_set, scene
 
@@ -25,33 +25,19 @@ class PowerCutError(Exception):
     """Ends an export in the middle."""
 
 
-class CutAfter:
+class CutAfter(PixelsOfAnother):
     """Pixels that can be read so often, and no more."""
 
     def __init__(self, inner: Pixels, reads: int) -> None:
-        self._inner, self.left, self.read = inner, reads, list[str]()
+        super().__init__(inner)
+        self.left, self.read = reads, list[str]()
 
     def picture(self, view: PosedView) -> bytes:
         if self.left == 0:
             raise PowerCutError
         self.left -= 1
         self.read.append(view.name)
-        return self._inner.picture(view)
-
-    def colours(self, view: PosedView) -> NDArray[np.uint8]:
-        return self._inner.colours(view)
-
-    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
-        return self._inner.depth_m(view)
-
-    def normal(self, view: PosedView) -> NDArray[np.float32]:
-        return self._inner.normal(view)
-
-    def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        return self._inner.valid(view)
-
-    def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        return self._inner.markers(view)
+        return super().picture(view)
 
 
 @pytest.fixture

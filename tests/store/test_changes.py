@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -23,14 +22,6 @@ pytestmark = [
     pytest.mark.sqlite("listens to a server by itself"),
 ]
 FOR_EVER_S = 1e6
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    made = Cluster(brief=True)
-    made.start()
-    yield made
-    made.stop()
 
 
 @pytest.mark.parametrize("channel", ["jobs", "chains"])

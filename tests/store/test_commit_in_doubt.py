@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -23,14 +23,6 @@ pytestmark = [
     pytest.mark.sqlite("begins a server by itself"),
 ]
 KINDS = ["run_started", "viewpoint_captured", "job_enqueued"]
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    made = Cluster(brief=True)
-    made.start()
-    yield made
-    made.stop()
 
 
 @pytest.fixture

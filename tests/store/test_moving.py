@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,19 +17,10 @@ from service.store.records import SITE, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.processes.postgres import Cluster
 from tests.support.record.store import CountedIds, capture, enqueue, start_run
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.sqlite("moves runs between the two databases by itself")]
 NOTE = StepNote(step="capture", attempt=1, note="Müller", data={"lux": 0.1 + 0.2})
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    made = Cluster(brief=True)
-    made.start()
-    yield made
-    made.stop()
 
 
 def fill(folder: Path, first_id: int = 0) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -46,14 +46,6 @@ CATALOGUE = (
     "CROSS JOIN LATERAL aclexplode(coalesce(relacl, acldefault('r', relowner))) "
     "WHERE relnamespace = 'public'::regnamespace AND relkind = 'r'",
 )
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    made = Cluster(brief=True)
-    made.start()
-    yield made
-    made.stop()
 
 
 @pytest.fixture(scope="module")

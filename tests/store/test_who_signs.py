@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,14 +25,6 @@ pytestmark = [
     pytest.mark.sqlite("shares the database of a server by itself"),
 ]
 NOTE = StepNote(step="s", attempt=1, note="n")
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    made = Cluster(brief=True)
-    made.start()
-    yield made
-    made.stop()
 
 
 @pytest.fixture
