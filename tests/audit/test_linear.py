@@ -17,7 +17,7 @@ from service.web.capture.view import views_of
 from tests.support.record.counting import lines_of
 from tests.support.soak.large_record import STEP, LargeRecord
 
-SMALL, LARGE = 100, 200
+SMALL, LARGE = 40, 80
 MOST = 2.3  # limit of the ratio for twice as many viewpoints
 
 
