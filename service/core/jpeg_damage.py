@@ -37,7 +37,7 @@ def damaged_jpegs(files: Sequence[Path]) -> dict[Path, str]:
     Files of other kinds are passed over. A file with which the decoder ends, or does not end, is a damaged one too.
     """
     found: dict[Path, str] = {}
-    left = list(files)
+    left = [file for file in files if _begins_as_jpeg(file)]  # without any, no process is started
     while left:
         said, end = _decoded(left)
         parts = _FILE.split(said)[1:]  # number, text, number, text, …
@@ -53,6 +53,15 @@ def damaged_jpegs(files: Sequence[Path]) -> dict[Path, str]:
         found[begun[-1][0]] = f"its picture cannot be decoded ({end})"
         left = left[len(begun) :]
     return found
+
+
+def _begins_as_jpeg(file: Path) -> bool:
+    """Return whether a file begins as a JPEG does; whoever reads one that cannot be opened says so."""
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(JPEG_BEGINS)) == JPEG_BEGINS
+    except OSError:
+        return False
 
 
 def _decoded(files: Sequence[Path]) -> tuple[str, str]:
@@ -93,8 +102,7 @@ def _decode_all() -> None:
             data = np.fromfile(os.fsdecode(name), np.uint8)
         except OSError:
             continue  # whoever reads the file next says so
-        if data[:2].tobytes() == JPEG_BEGINS:
-            cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+        cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 if __name__ == "__main__":
