@@ -1,4 +1,4 @@
-"""Marks as `slow` the tests that cost a CPU second or more, and keeps the list of what each test costs.
+"""Marks as `slow` the tests that cost much processor time, and keeps the list of what each test costs.
 
 `make marks` runs the tests with `--cpu-record` (tests/plugins/cpu_record.py) and then this script on what they
 recorded; `make marks FILES=tests/core` measures one folder and leaves the rest of the list alone. `make lint` calls
@@ -7,7 +7,7 @@ it with `--check`: the list and the marks must agree, and every test must be on 
 The cost of a test is its own, plus its share of each wider fixture that it uses: the fixture's cost over the number
 of tests that use it. Of a parametrised test the dearest row counts. A measurement within a fifth of the limit changes
 no mark, so that marks do not come and go with the machine's mood. Tests marked `whole` are never fast, and are not
-measured.
+measured. The limit is 0.8 CPU seconds, and one where tests guard people or evidence (`limit_s`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,17 @@ import re
 import sys
 from pathlib import Path
 
-from tests.support.suite.marks import LIST, Costs, costs_of, disagreements, remarked, settled, sources, test_functions
+from tests.support.suite.marks import (
+    LIST,
+    Costs,
+    costs_of,
+    disagreements,
+    limit_s,
+    remarked,
+    settled,
+    sources,
+    test_functions,
+)
 
 
 def main() -> int:
@@ -34,13 +44,13 @@ def main() -> int:
         kept: Costs = {}
         for file, source in files.items():
             before, now = listed.get(file, {}), measured.get(file, {})
-            names = [test.name for test in test_functions(source)]
-            kept[file] = {name: settled(before.get(name), now[name]) for name in names if name in now} | {
+            names, most_s = [test.name for test in test_functions(source)], limit_s(file)
+            kept[file] = {name: settled(before.get(name), now[name], most_s) for name in names if name in now} | {
                 name: before[name] for name in names if name in before and name not in now
             }
             single = re.sub(r"(?m)^pytestmark = pytest\.mark\.slow( *#.*)?\n", "", source)
             single = re.sub(r"(?m)^(pytestmark = \[(?!.*mark\.whole).*?)pytest\.mark\.slow(?:, )?", r"\1", single)
-            files[file] = remarked(single, kept[file])
+            files[file] = remarked(single, kept[file], most_s)
             if files[file] != source:
                 Path(file).write_text(files[file])
         LIST.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")

@@ -77,6 +77,7 @@ def test_a_page_that_follows_a_run_does_not_plan_it_anew(records: tuple[LargeRec
     assert lines_of(capture_page(record), "/service/core/geometry.py") == 0
 
 
+@pytest.mark.slow
 def test_whether_a_photograph_is_there_already_is_asked_without_reading_them_all(
     records: tuple[LargeRecord, LargeRecord],
 ) -> None:

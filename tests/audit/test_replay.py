@@ -222,6 +222,7 @@ def test_command_says_equal_with_status_0(folder: Path, tmp_path: Path) -> None:
     assert kept.read_bytes() == files.artefact_path(recorded.ref.sha256).read_bytes()
 
 
+@pytest.mark.slow
 def test_command_says_where_and_by_how_much_with_status_1(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hand(monkeypatch, "locate_spheres", moved_spheres)
     answer = invoke(folder, "--jobs", "locate_spheres")

@@ -72,6 +72,7 @@ def test_pairs_have_useful_angles_and_lonely_views_get_wider_ones() -> None:
         stereo_pairs([blank(eye_at(0, 45)), blank(eye_at(180, 45))])
 
 
+@pytest.mark.slow
 def test_the_depth_of_a_pair_is_that_of_the_scene() -> None:
     views = [seen_from(eye_at(0)), seen_from(eye_at(30))]
     pair = rectified(views[0], views[1], looked_at_m(views))

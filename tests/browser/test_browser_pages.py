@@ -303,6 +303,7 @@ def test_a_dialog_holds_the_focus_and_gives_it_back(desk: Desk, run: str, opener
         expect(button).to_be_focused()
 
 
+@pytest.mark.slow
 def test_a_locked_screen_is_unlocked_by_keys_and_cannot_be_escaped(desk: Desk) -> None:
     shown = desk.screen("technician")
     page = shown.page

@@ -107,6 +107,7 @@ def test_a_checkerboard_is_not_circles(photographs: BoardFolder) -> None:
     assert "squares, not circles" in wrong.words
 
 
+@pytest.mark.slow
 def test_a_legacy_board_is_calibrated_and_serves_hand_eye(charuco: BoardFolder, tmp_path: Path) -> None:
     options = ["--pattern", "charuco", "--board", "8x5", "--square-mm", "22", "--marker-mm", "16"]
     options += ["--dictionary", "DICT_4X4_100", "--legacy"]

@@ -68,6 +68,7 @@ def _done(arguments: tuple[Store, dict[str, Any]], **other: Any) -> JobAnswer:
     return HANDLERS["calibrate"](JobContext(given | other, store, Path("unused"), lambda *_: None))
 
 
+@pytest.mark.slow
 def test_a_job_gives_the_bow_and_the_size_of_the_board(arguments: tuple[Store, dict[str, Any]]) -> None:
     done = _done(arguments)
     answer = calibrate.KIND.read_answer(done.result)

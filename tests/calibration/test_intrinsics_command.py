@@ -120,6 +120,7 @@ def test_a_zoom_that_moved_after_the_calibration_is_named(folder: Path, tmp_path
     assert "c2.jpg" in done.output
 
 
+@pytest.mark.slow
 def test_images_without_the_board_end_with_the_reason(folder: Path, tmp_path: Path) -> None:
     poor = tmp_path / "poor"
     poor.mkdir()

@@ -68,6 +68,7 @@ def test_each_recorded_body_is_replayed() -> None:
     assert set(names()) == set(TOLD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", TOLD)
 def test_a_recorded_body_is_driven_or_refused_in_words_that_help(body: str, tmp_path: Path) -> None:
     """Before, three of them ended the driver with SIGSEGV or hung at each setting for six seconds."""

@@ -221,6 +221,7 @@ def test_exposure_follows_the_settings_and_the_light(renderer: Renderer, scene: 
         assert ratio == pytest.approx(gain, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_picture_and_another_only_other_noise(
     renderer: Renderer, scene: Scene, plain: Picture
 ) -> None:
@@ -235,6 +236,7 @@ def test_the_same_seed_gives_the_same_picture_and_another_only_other_noise(
 # --- what lies there --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_control_spheres_and_spray_change_only_what_they_touch(
     renderer: Renderer, scene: Scene, plain: Picture
 ) -> None:

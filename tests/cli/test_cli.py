@@ -348,6 +348,7 @@ def test_doctor_is_content_with_a_rig_that_is_well(tmp_path: Path) -> None:
     assert answer_of(result)["devices"]["scanner"]["identity"]["kind"] == "scanner"
 
 
+@pytest.mark.slow
 def test_simulate_becomes_a_simulator_and_the_doctor_finds_it(tmp_path: Path) -> None:
     link = tmp_path / "lightbox"
     with subprocess.Popen(

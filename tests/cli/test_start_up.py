@@ -91,6 +91,7 @@ def test_it_starts_without_numerics(words: str, data: Path) -> None:
     assert not (NUMERICS | OF_THE_WEB | OF_AN_OLD_STORE) & set(outcome["modules"])
 
 
+@pytest.mark.slow
 def test_the_state_of_a_run_that_computes_is_told_without_numerics(tmp_path: Path) -> None:
     data = unpack_recorded_run(tmp_path)
     Store.open(data).close()  # upgrades it once

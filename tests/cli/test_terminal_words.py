@@ -131,6 +131,7 @@ def test_the_help_groups_every_command_by_what_it_is_for() -> None:
     assert all(len(line) <= 80 for line in shown.splitlines())
 
 
+@pytest.mark.slow
 def test_the_shell_completes_commands() -> None:
     assert _completed("orthocapture re", 1) == ["resume", "replay", "register"]
     assert _completed("orthocapture calibrate ", 2) == ["intrinsics", "hand-eye"]

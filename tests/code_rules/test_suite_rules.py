@@ -185,11 +185,11 @@ def test_marks_follow_from_the_costs_and_the_check_names_what_disagrees() -> Non
         "class TestClass:\n    def test_dear(self) -> None: ...\n"
     )
     costs = {"test_cheap": 0.1, "TestClass::test_dear": 3.0}
-    assert remarked(source, costs) == (
+    assert remarked(source, costs, 0.8) == (
         "import pytest\n\n\n@pytest.mark.timeout(9)\ndef test_cheap() -> None: ...\n\n\n"
         "class TestClass:\n    @pytest.mark.slow\n    def test_dear(self) -> None: ...\n"
     )
-    assert disagreements({"a": costs}, {"a": remarked(source, costs)}) == []
+    assert disagreements({"a": costs}, {"a": remarked(source, costs, 0.8)}) == []
     assert disagreements({"a": {"test_gone": 0.1}, "b": {}}, {"a": source}) == [
         "a::TestClass::test_dear was not measured",
         "a::test_cheap was not measured",
@@ -214,7 +214,7 @@ def test_marks_follow_from_the_costs_and_the_check_names_what_disagrees() -> Non
     ],
 )
 def test_a_measurement_near_the_limit_changes_no_mark(before_s: float | None, now_s: float, listed_s: float) -> None:
-    assert settled(before_s, now_s) == listed_s
+    assert settled(before_s, now_s, 1.0) == listed_s
 
 
 def test_the_list_is_written_from_records_and_then_the_check_is_content(

@@ -129,6 +129,7 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Callable
 # --- the walk ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "leave_by"),
     [

@@ -279,6 +279,7 @@ def test_a_file_with_a_path_for_a_uid_or_other_content_under_a_known_uid_is_refu
     assert {path.name for path in tmp_path.iterdir()} == {"suite", "ct"}
 
 
+@pytest.mark.slow
 def test_connections_that_say_nothing_or_nonsense_block_nobody(tmp_path: Path) -> None:
     write_series(tmp_path / "suite", uid=UID)
     with receiving(tmp_path / "ct") as listener:

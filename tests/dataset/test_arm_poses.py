@@ -79,6 +79,7 @@ def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, nam
     assert dataset.statement["pose_covariance"] == dataset.about.covariance
 
 
+@pytest.mark.slow
 def test_the_outlines_of_each_image_are_in_the_covariance_of_poses_by_the_spheres(
     run: RecordedRun, tmp_path: Path
 ) -> None:
@@ -100,6 +101,7 @@ def test_the_outlines_of_each_image_are_in_the_covariance_of_poses_by_the_sphere
     assert dataset.statement["pose_covariance"].startswith("all of it: what the outlines of the spheres")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ARM)
 def test_a_job_of_an_earlier_version_answers_as_it_did_but_for_what_contradicts(
     run: RecordedRun, name: str, tmp_path: Path

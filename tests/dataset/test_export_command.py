@@ -112,6 +112,7 @@ def test_control_spheres_that_the_scan_no_longer_shows_are_masked(recorded: Path
         assert np.count_nonzero(sphere_like & ~markers) < 0.06 * np.count_nonzero(sphere_like)
 
 
+@pytest.mark.slow
 def test_crops_of_a_run_are_free_of_markers(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "crops"
     status, printed = export(
@@ -144,6 +145,7 @@ def test_an_export_of_altered_evidence_is_refused(recorded: Path, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "statement",
     [

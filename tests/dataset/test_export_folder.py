@@ -186,6 +186,7 @@ def test_a_data_set_without_room_for_a_crop_says_so(dataset: DataSet) -> None:
         cropped_data_set(dataset, lambda view: np.zeros((view.camera.height, view.camera.width), bool), (64, 48))
 
 
+@pytest.mark.slow
 def test_progress_counts_every_file_up_to_its_total(dataset: DataSet, tmp_path: Path) -> None:
     for name in exporters():
         told: list[tuple[str, int, int]] = []

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
+import pytest
 import trimesh
 from PIL import Image
 
@@ -39,6 +40,7 @@ def write_textured(folder: Path) -> None:
     (folder / "tex" / "SKIN.PNG").write_bytes(parts[picture_name])
 
 
+@pytest.mark.slow
 def test_a_textured_scan_leaves_as_it_came(tmp_path: Path) -> None:
     write_textured(tmp_path / "scans")
     rig = OneScanner()

@@ -91,6 +91,7 @@ def uncontrolled(tmp_path: Path) -> Any:
     bench.store.close()
 
 
+@pytest.mark.slow
 def test_table_and_budget_with_control_spheres_and_ct(controlled: Bench) -> None:
     covariance = np.diag([0.3, 0.3, 0.2, 0.2, 1e-4, 1e-4, 1e-5, 1e-5]) ** 2
     colmap = controlled.register(intrinsics_covariance=covariance.tolist())
@@ -141,6 +142,7 @@ def test_a_registration_without_poses_of_the_control_images_is_refused(controlle
         controlled.evaluate({"colmap": colmap}, control_scan=spheres(np.vstack([REGISTRATION_M, CONTROL_M]), 2))
 
 
+@pytest.mark.slow
 def test_a_displaced_control_sphere_fails_its_own_gate_and_is_told(controlled: Bench) -> None:
     colmap = controlled.register()
     figures: list[float] = []

@@ -85,6 +85,7 @@ def test_a_day_without_trouble(tmp_path: Path) -> None:
         assert b"$X" not in tap.sent
 
 
+@pytest.mark.slow
 def test_a_pose_off_the_circle_cannot_be_reached(tmp_path: Path) -> None:
     with table(tmp_path) as port, opened(port) as arm:
         higher = transform(np.eye(3), np.array([0, 0, 0.2])) @ mount()
@@ -94,6 +95,7 @@ def test_a_pose_off_the_circle_cannot_be_reached(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.degrees(near), [-390.0], atol=1e-3)  # not a needless revolution
 
 
+@pytest.mark.slow
 def test_a_stop_brakes_and_the_axes_go_on_from_there(tmp_path: Path) -> None:
     with table(tmp_path) as port, opened(port) as arm:
         let_move(arm)
@@ -178,6 +180,7 @@ def test_axes_that_nobody_looks_at_are_stopped(tmp_path: Path) -> None:
         assert degrees(arm)[0] > -600, "it stopped on its way"
 
 
+@pytest.mark.slow
 def test_without_its_host_the_machine_soon_stands(tmp_path: Path) -> None:
     """The driver's process is killed during a motion: the controller has only a moment of it in its buffer."""
     with table(tmp_path) as port, Tap(port, tmp_path) as tap, opened(tap.port) as arm:
@@ -238,6 +241,7 @@ def test_a_cable_that_is_pulled_while_it_homes_is_unavailable_and_not_a_question
         travel(arm, -10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", ["answer", "command"])
 def test_homing_without_an_answer_is_noticed_long_before_its_longest_time(tmp_path: Path, lost: str) -> None:
     plan = fault(on="$H", kind="drop") if lost == "command" else ()
@@ -280,6 +284,7 @@ def losing_answers(tap: Tap) -> contextlib.AbstractContextManager[RobotArm]:
     return opened(tap.port, answer_timeout_s=ANSWER_S)
 
 
+@pytest.mark.slow
 def test_a_lost_answer_to_a_piece_of_a_motion_costs_a_moment(tmp_path: Path) -> None:
     with table(tmp_path) as port, Tap(port, tmp_path, losing(1, b"$J=")) as tap, losing_answers(tap) as arm:
         let_move(arm)

@@ -147,6 +147,7 @@ def test_the_ct_is_in_the_wound_the_scan_outside_and_the_mesh_closed() -> None:
     assert len(rim_vertices(result.surface)) == 0
 
 
+@pytest.mark.slow
 def test_sigma_is_each_sources_and_includes_the_alignment() -> None:
     result = fused()
     assert np.all(result.sigma_m[result.source == Source.SCAN] == pytest.approx(5e-5))

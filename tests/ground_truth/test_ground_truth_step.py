@@ -245,6 +245,7 @@ def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth
     assert above[:, 2] == pytest.approx(height(above[:, 0], above[:, 1]), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_without_a_ct_the_step_says_so_and_passes(bench: Bench) -> None:
     operator = ScriptedOperator()
     operator.script = {("ct", "confirm"): [lambda q, _s: answer(q, "skip", reason="there is none")]}

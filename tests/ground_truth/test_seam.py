@@ -43,6 +43,7 @@ def test_a_slope_is_no_step_even_if_it_changes_at_the_seam() -> None:
     assert np.max(np.abs(found.step_m)) < 0.05 * STEP_M
 
 
+@pytest.mark.slow
 def test_the_standard_error_is_that_of_noise_which_neighbours_share() -> None:
     found = [measured(noise(3e-5, seed)) for seed in range(4)]
     spread = np.std(np.concatenate([one.step_m / one.error_m for one in found]))

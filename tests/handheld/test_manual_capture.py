@@ -84,6 +84,7 @@ def test_a_repeated_image_is_told_apart(
     assert result(bench).result["not_used"] == {"h_003": "it repeats h_002"}
 
 
+@pytest.mark.slow
 def test_the_screen_releases_and_ends_the_capture(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -125,6 +125,7 @@ def test_damaged_photographs_are_an_error_that_names_them_all(folder: Path, tmp_
     assert not (tmp_path / "data").exists()
 
 
+@pytest.mark.slow
 def test_what_the_protocol_needs_must_be_there(folder: Path) -> None:
     shutil.rmtree(folder / "scan")
     assert "the protocol needs scan" in refusal(str(folder), "--dry-run")
@@ -143,6 +144,7 @@ def test_nobody_imports_in_the_name_of_an_account_without_its_password(folder: P
         assert store.runs() == []
 
 
+@pytest.mark.slow
 def test_one_whole_series_is_the_ct(folder: Path) -> None:
     slices = sorted((folder / "ct").glob("*.dcm"))
     assert [file.path for file in listed(folder).files["ct"]] == [f"ct/{path.name}" for path in slices]

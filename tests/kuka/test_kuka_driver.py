@@ -182,6 +182,7 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
         confirm_and(arm, lambda: travel(arm, turned(arm, 0.1)))
 
 
+@pytest.mark.slow
 def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
     host = address(78)
     with simulated_kuka(host, "--speed-up", "4"), opened(host) as arm:

@@ -206,6 +206,7 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         assert "MONITORING_READY" in report.details["FRI"], "it has commanded nothing"
 
 
+@pytest.mark.slow
 def test_idle_ends_the_session_and_its_poses() -> None:
     """As in a log of a real arm: lbr_fri_ros2_stack#251."""
     faults = [{"device": "robot", "on": "fri", "kind": "end", "nth": 150}]

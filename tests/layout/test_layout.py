@@ -150,6 +150,7 @@ def _photographed(scene: Scene, count: int, seed: int = 0) -> list[SpherePhotogr
     return photographs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [21, 47])
 def test_further_photographs_decide_what_one_leaves_open(seed: int) -> None:
     """Scene 21's photograph showed less than the CT: its spheres can be confused, those of scene 47 cannot."""

@@ -238,6 +238,7 @@ def test_outlines_are_right_and_know_how_right_under_any_light(look: Look, least
     assert 0.02 < float(np.mean(chi2)) < 6
 
 
+@pytest.mark.slow
 def test_a_colour_given_in_advance_leaves_out_discs_of_another() -> None:
     cam = camera(800)
     centres = np.array([[-0.08, -0.03, 0.55], [0.08, 0.03, 0.6]])
@@ -300,6 +301,7 @@ def test_an_arc_that_fills_the_image_is_no_outline_and_no_fault() -> None:
                     assert found is None or 0 < found.cone.half_angle_rad < np.pi / 2
 
 
+@pytest.mark.slow
 def test_a_sphere_of_any_size_is_found_where_its_size_is_told() -> None:
     width, height, radius = 1024, 700, 300.0
     lens = CameraModel(width, height, 1228, 1228, 511.5, 349.5)

@@ -71,6 +71,7 @@ def scored(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return out, json.loads(printed)
 
 
+@pytest.mark.slow
 def test_sift_finds_poses_and_fewer_matches_of_difficult_pairs(scored: tuple[Path, Any]) -> None:
     classes = scored[1]["classes"]
     assert len(classes) >= 3
@@ -86,6 +87,7 @@ def test_sift_finds_poses_and_fewer_matches_of_difficult_pairs(scored: tuple[Pat
         assert list(one["precision"].values()) == sorted(one["precision"].values())
 
 
+@pytest.mark.slow
 def test_the_folder_has_table_curves_and_pictures(scored: tuple[Path, Any]) -> None:
     out, printed = scored
     table = (out / "table.md").read_text(encoding="utf-8")
@@ -120,6 +122,7 @@ def test_methods_share_a_table_if_they_share_their_pairs(
     assert any(line.startswith("| sift | all |") for line in lines)
 
 
+@pytest.mark.slow
 def test_pairs_are_chosen_evenly_and_alike(folder: Path, scored: tuple[Path, Any]) -> None:
     pairs = scored[1]["pairs"]
     listed = [(pair["first"], pair["second"]) for pair in MatchingData(folder).pairs]

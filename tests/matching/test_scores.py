@@ -73,6 +73,7 @@ def test_areas_found_by_hand(errors: list[float], threshold: float, area: float)
     assert auc(errors, threshold) == pytest.approx(area)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.lists(st.floats(0.0, 180.0), min_size=1, max_size=30), st.floats(0.5, 30.0))
 def test_an_area_is_a_share_in_any_order_and_falls_with_errors(errors: list[float], threshold: float) -> None:

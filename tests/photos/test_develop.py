@@ -88,6 +88,7 @@ def test_the_picture_lies_where_the_jpeg_shows_it(pair: tuple[Path, Path]) -> No
     assert np.array_equal(develop(raw, read_bgr(jpeg)).image_bgr, made.image_bgr), "the same file, the same picture"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("found", ["matched", "moved"])
 def test_a_crop_that_is_missing_or_wrong_is_found_by_the_jpeg(pair: tuple[Path, Path], found: str) -> None:
     raw, jpeg = pair
@@ -159,6 +160,7 @@ def test_shifts_are_found_to_hundredths_of_a_pixel(shift_px: tuple[float, float]
     assert not find_shift(grey, np.full_like(grey, 128)).certain
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_tiff_and_its_record(pair: tuple[Path, Path], tmp_path: Path) -> None:
     raw, jpeg = pair
     words = ["develop", str(raw), "--out", str(tmp_path / "out")]

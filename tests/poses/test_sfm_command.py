@@ -85,6 +85,7 @@ def test_wrong_principal_point_is_refined(capture: tuple[Path, dict[str, Transfo
     assert rms_m(tmp_path / "out", poses) < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
@@ -100,6 +101,7 @@ def test_contradicting_options_are_refused(
     assert reason in " ".join(done.output.split())
 
 
+@pytest.mark.slow
 def test_robot_poses_of_other_images_are_refused(capture: tuple[Path, dict[str, Transform]], tmp_path: Path) -> None:
     write_poses_csv(tmp_path / "robot.csv", {"other.png": np.eye(4)})
     done = RUNNER.invoke(app, arguments(capture[0], tmp_path / "out", "--robot-poses", str(tmp_path / "robot.csv")))

@@ -216,6 +216,7 @@ def test_a_run_recorded_before_results_could_come_later_misses_nothing() -> None
     assert missing_results(run.protocol, run.state, {}, NOW, 2) == []
 
 
+@pytest.mark.slow
 def test_a_later_and_better_registration_is_reported_and_takes_nobodys_place() -> None:
     run = _Run(protocol())
     steps = dict(run.state.steps)

@@ -96,6 +96,7 @@ def test_a_fork_ends_as_a_real_start_does(how: str) -> None:
     assert ("at exit" in forked.last[0]) == (how not in ("abort", "broken"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "status"),
     [

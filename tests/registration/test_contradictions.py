@@ -125,6 +125,7 @@ def test_a_wrong_focal_length_is_measured_and_named_and_its_effect_is_counted() 
     assert in_sigma(unsure) < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("of_list", "of_positions", "wrong"),
     [(1.01, 1.0, "so that the list is wrong"), (1.0, 1.01, "so that the positions are wrong"), (0.9985, 1.0, "")],
@@ -153,6 +154,7 @@ def test_a_list_so_far_off_that_nothing_fits_is_told_with_its_scale(factor: floa
         registered(seen()[:3], poses=MADE.T_world_camera[:3], listed_m=factor * REGISTRATION_M, named=False)
 
 
+@pytest.mark.slow
 def test_positions_in_another_unit_than_list_and_radius_are_told_with_their_scale() -> None:
     poses = MADE.T_world_camera.copy()
     poses[:, :3, 3] /= 25.4

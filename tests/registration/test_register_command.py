@@ -143,6 +143,7 @@ def true_error_mm(record: dict[str, Any], capture: Capture) -> float:
 # --- what it computes -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_spheres_and_csv(capture: Capture, record: dict[str, Any]) -> None:
     assert true_error_mm(record, capture) < 0.1
     assert record["scale"] == 1.0
@@ -166,6 +167,7 @@ def test_its_limits_of_control_spheres_are_the_gates_of_the_shipped_protocol(rec
     assert [own[measure] for measure in both] == [limits[measure] for measure in both]
 
 
+@pytest.mark.slow
 def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, record: dict[str, Any]) -> None:
     assert [entry["image"] for entry in record["images"]] == sorted(capture.T_world_camera)
     seen = 0

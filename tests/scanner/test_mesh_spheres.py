@@ -75,6 +75,7 @@ def _nearest(centres: Array) -> Array:
     return distance.min(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flipped", [False, True])
 def test_partial_noisy_spheres_among_clutter(flipped: bool) -> None:
     vertices, faces = _scan(noise_m=5e-5)

@@ -119,6 +119,7 @@ def test_a_profile_that_is_not_installed_is_refused_with_those_that_are(tmp_path
         ScanFolderConfig(folder=tmp_path, profile="artek")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ply", "obj"])
 @pytest.mark.parametrize("profile", ["artec_leo", "artec_space_spider"])
 def test_what_the_simulated_artec_studio_exports_is_read_with_its_texture(

@@ -63,6 +63,7 @@ def test_a_wrong_radius_is_told_with_the_one_that_the_spheres_have(tmp_path: Pat
     assert more in words
 
 
+@pytest.mark.slow
 def test_a_ball_of_another_radius_is_accepted_by_option(tmp_path: Path) -> None:
     mesh = _balls(tmp_path / "ball.stl", 9.75)
     words = ("--radius-mm", "9.4", "--mesh-unit", "mm", "--seeds", "0,0,0")

@@ -53,6 +53,7 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
     assert 5.0 < np.mean(found) < 7.0
 
 
+@pytest.mark.slow
 @given(SEEDS, st.floats(2.0, 6.0))
 @settings(max_examples=30, deadline=None)
 def test_poses_that_scatter_more_than_stated_widen_the_covariance(seed: int, factor: float) -> None:
@@ -92,6 +93,7 @@ def test_false_poses_that_agree_with_one_another_do_not_win_over_more_true_ones(
     assert np.linalg.norm(deviation(found.T, truth)) < 1.5e-3
 
 
+@pytest.mark.slow
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_the_mean_moves_with_the_frame(seed: int) -> None:

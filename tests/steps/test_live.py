@@ -87,6 +87,7 @@ def test_clipped_pixels_are_counted_whichever_channel_clips() -> None:
     assert clipped_fraction(image) == pytest.approx(0.375)
 
 
+@pytest.mark.slow
 def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     known, views = None, list[LiveView]()

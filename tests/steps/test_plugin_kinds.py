@@ -121,6 +121,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 pytestmark = pytest.mark.timeout(330)
 
 
+@pytest.mark.slow
 def test_a_run_computes_with_it(seen: dict[str, Any]) -> None:
     assert seen["status"] == "completed"
     assert seen["measures"] == {"weight_g": 501.0}
@@ -131,6 +132,7 @@ def test_the_page_has_its_words_and_its_drawing(seen: dict[str, Any]) -> None:
     assert "<svg viewBox='0 0 9 9'><title>scales</title></svg>" in seen["run_page"]
 
 
+@pytest.mark.slow
 def test_the_audit_draws_it_and_calls_it_by_its_words(seen: dict[str, Any]) -> None:
     assert ["weigh", True] in seen["drawn"]
     assert ["weight", False] in seen["drawn"]
@@ -141,6 +143,7 @@ def test_a_replay_computes_it_again(seen: dict[str, Any]) -> None:
     assert seen["replayed"] == [["weigh", "identical"]]
 
 
+@pytest.mark.slow
 def test_the_protocol_check_and_the_documents_know_its_measures(seen: dict[str, Any]) -> None:
     (problem,) = seen["problems"]
     assert "weight_mg" in problem

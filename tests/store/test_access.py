@@ -129,6 +129,7 @@ def test_a_folder_of_an_earlier_version_is_closed_and_the_log_says_so(
         assert not caplog.records
 
 
+@pytest.mark.slow
 def test_opening_again_in_one_process_keeps_the_locks_that_keep_the_log_from_others(tmp_path: Path) -> None:
     """POSIX releases a process's locks when it closes any descriptor of the file, and the log would be removed."""
     data = tmp_path / "data"

@@ -145,6 +145,7 @@ def test_the_second_backup_copies_only_what_is_new(tmp_path: Path, data: Path) -
     assert [v for (v,) in rows(tmp_path / "new", viewpoints)] == ["v1", "v2", "v3", "v4"]
 
 
+@pytest.mark.slow
 def test_killed_or_without_power_at_any_point_no_half_backup_looks_whole(tmp_path: Path, small: Path) -> None:
     counted = CrashingFiles()
     back_up(small, tmp_path / "counted", files=counted)

@@ -82,6 +82,7 @@ def test_a_file_system_whose_locks_fail_or_exclude_nobody_is_refused(
         mounts.require_own_mount(tmp_path)
 
 
+@pytest.mark.slow
 def test_who_knows_better_allows_it_for_a_command_and_what_it_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -73,6 +73,7 @@ def site(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_goes_to_another_record_and_back_with_every_number_the_same(site: Path, tmp_path: Path) -> None:
     cart = tmp_path / "cart"
     run_id = fill(cart)

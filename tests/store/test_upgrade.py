@@ -79,6 +79,7 @@ def test_it_is_replayed_with_equal_results(data: Path) -> None:
     assert [job["kind"] for job in said["jobs"]] == ["locate_spheres"]
 
 
+@pytest.mark.slow
 def test_a_run_is_added_to_it(data: Path, tmp_path: Path) -> None:
     with Store.open(data) as store:
         assert begin_run(store, PROTOCOL, tmp_path).run().terminal

@@ -70,6 +70,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_commands_are_those_that_tests_start_as_processes(name: str) -> None:
     command, given = parsed(COMMANDS[name])

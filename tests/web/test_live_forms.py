@@ -64,6 +64,7 @@ def test_a_form_about_something_else_is_refused(web: WebSite, state: Callable[[W
     assert refuse_every_other_subject(seen)
 
 
+@pytest.mark.slow
 def test_a_form_of_a_capture_by_hand_about_something_else_is_refused(web: WebSite, tmp_path: Path) -> None:
     with by_hand(tmp_path, web) as seen:
         assert ("held", "") in refuse_every_other_subject(seen)

@@ -50,6 +50,7 @@ def settle(web: WebSite, address: str) -> str:
     return page
 
 
+@pytest.mark.slow
 def test_every_page_can_be_read_by_every_role_and_by_nobody_else(web: WebSite, run: str) -> None:
     assert all(may(role, "read") for role in ("technician", "supervisor", "auditor", "administrator"))
     for address in addresses(web, run):
@@ -70,6 +71,7 @@ def test_first_page_shows_deviations_before_everything_else(web: WebSite, run: s
     assert "a hand in the picture 0" in text
 
 
+@pytest.mark.slow
 def test_auditors_change_nothing_but_may_verify(web: WebSite, run: str) -> None:
     modules = (overview, pages, evidence)
     routes = [route for page in modules for route in page.router.routes]

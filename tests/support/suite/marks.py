@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-LIMIT_S = 1.0
+_LIMIT_S, _LIMIT_OF_GUARDS_S = 0.8, 1.0
+# What protects people and evidence is tested by `make test` also where that takes longer.
+_GUARDS = tuple(f"tests/{folder}/" for folder in ("people", "recovery", "robot", "run", "server", "verify"))
 LIST = Path("tests/cpu_seconds.json")
 MARK = "@pytest.mark.slow"
 Costs = dict[str, dict[str, float]]  # file → test function (`Class::test` in a class) → CPU seconds
@@ -25,6 +27,11 @@ class TestFunction:
     line: int  # of its first decorator, or of `def`; counted from 1
     indent: str
     slow: bool
+
+
+def limit_s(file: str) -> float:
+    """Return the CPU seconds from which on a test of a file is slow."""
+    return _LIMIT_OF_GUARDS_S if file.startswith(_GUARDS) else _LIMIT_S
 
 
 def costs_of(folder: Path) -> Costs:
@@ -54,12 +61,12 @@ def costs_of(folder: Path) -> Costs:
     return costs
 
 
-def settled(before_s: float | None, now_s: float) -> float:
+def settled(before_s: float | None, now_s: float, limit_s: float) -> float:
     """Return the cost to be listed: the one before, unless the new one differs by more than a measurement does."""
     if before_s is None:
         return round(now_s, 1)
-    if (before_s < LIMIT_S) != (now_s < LIMIT_S):
-        return round(now_s, 1) if abs(now_s - LIMIT_S) > 0.2 * LIMIT_S else before_s
+    if (before_s < limit_s) != (now_s < limit_s):
+        return round(now_s, 1) if abs(now_s - limit_s) > 0.2 * limit_s else before_s
     return round(now_s, 1) if abs(now_s - before_s) > max(0.3, 0.3 * before_s) else before_s
 
 
@@ -84,11 +91,11 @@ def test_functions(source: str) -> Iterator[TestFunction]:
         yield from within(ast.parse(source).body, "")
 
 
-def remarked(source: str, costs: Mapping[str, float]) -> str:
+def remarked(source: str, costs: Mapping[str, float], limit_s: float) -> str:
     """Return the source with the mark on those tests that cost the limit or more, and on no others."""
     lines = source.splitlines(keepends=True)
     for test in sorted(test_functions(source), key=lambda test: -test.line):
-        slow = costs.get(test.name, 0.0) >= LIMIT_S
+        slow = costs.get(test.name, 0.0) >= limit_s
         if slow and not test.slow:
             lines.insert(test.line - 1, f"{test.indent}{MARK}\n")
         elif test.slow and not slow:
@@ -113,7 +120,7 @@ def disagreements(listed: Costs, files: Mapping[str, str]) -> list[str]:
         for name, test in tests.items():
             if name not in costs:
                 found.append(f"{file}::{name} was not measured")
-            elif test.slow != (costs[name] >= LIMIT_S):
+            elif test.slow != (costs[name] >= limit_s(file)):
                 found.append(
                     f"{file}::{name} costs {costs[name]} CPU s and is {'' if test.slow else 'not '}marked slow"
                 )

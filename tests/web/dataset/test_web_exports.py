@@ -351,6 +351,7 @@ def _refuse(*_arguments: object, **_more: object) -> None:
     raise StoreError("no space")
 
 
+@pytest.mark.slow
 def test_export_is_blocked_when_the_evidence_fails(web: WebSite, supervisor: Browser) -> None:
     run = web.record_run()
     image = next(item for item in web.store.artefacts(run) if item.ref.kind == "image")
