@@ -12,6 +12,7 @@ from sqlalchemy import Connection, bindparam, text
 from service.audit.filters import ArtefactFilter, EventFilter
 from service.audit.record.rows import LARGEST_SEQ, PAGE, EventRow, head, plain, read_rows
 from service.store.artefacts import to_artefact
+from service.store.database.database import is_postgres
 from service.store.event_index import cut_words, matching
 from service.store.records import Artefact, UnknownRunError
 
@@ -87,12 +88,12 @@ def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[st
         ),
         {"run": plain(run_id)},
     ).one()
-    # "|| ''" keeps SQLite from using an index on these columns.
-    conditions = ["i.position BETWEEN :low AND :high", "i.run_id || '' = :run"]
+    plus = "" if is_postgres(connection) else "+"  # keeps SQLite from using an index on these columns
+    conditions = ["i.position BETWEEN :low AND :high", f"{plus}i.run_id = :run"]
     values: dict[str, Any] = {"run": plain(run_id), "low": ends[0] or 0, "high": ends[1] or -1}
     for column, value in (("kind", wanted.kind), ("step", wanted.step), ("actor", wanted.person)):
         if value:
-            conditions.append(f"i.{column} || '' = :{column}")
+            conditions.append(f"{plus}i.{column} = :{column}")
             values[column] = plain(value)
     if wanted.device:
         conditions.append(
@@ -215,7 +216,7 @@ def artefacts_page(
     Raises UnknownRunError.
     """
     head(connection, run_id)
-    where, values = _artefact_condition(run_id, wanted)
+    where, values = _artefact_condition(connection, run_id, wanted)
     totals = connection.execute(
         text(f"SELECT count(*) AS n, coalesce(sum(size_bytes), 0) AS size FROM artefacts WHERE {where}"), values
     ).one()
@@ -231,7 +232,8 @@ def artefacts_page(
     return ArtefactPage([to_artefact(row) for row in rows], page, pages, totals.n, int(totals.size))
 
 
-def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[str, Any]]:
+def _artefact_condition(connection: Connection, run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[str, Any]]:
+    contains = "ILIKE" if is_postgres(connection) else "LIKE"  # either takes A for a, and no other letters for equal
     conditions, values = ["run_id = :run"], {"run": plain(run_id)}
     for column in ("kind", "step", "device", "viewpoint"):
         value = getattr(wanted, column)
@@ -241,8 +243,8 @@ def _artefact_condition(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[
     for index, word in enumerate(plain(wanted.q)[:200].replace("\0", " ").split()[:8]):
         escaped = word.replace("\\", r"\\").replace("%", r"\%").replace("_", r"\_")
         columns = ("original_name", "viewpoint", "sha256", "kind", "step", "who")
-        conditions.append("(" + " OR ".join(f"lower({c}) LIKE :word{index} ESCAPE '\\'" for c in columns) + ")")
-        values[f"word{index}"] = f"%{escaped.lower()}%"
+        conditions.append("(" + " OR ".join(f"{c} {contains} :word{index} ESCAPE '\\'" for c in columns) + ")")
+        values[f"word{index}"] = f"%{escaped}%"
     return " AND ".join(conditions), values
 
 

@@ -23,11 +23,12 @@ from service.core.records.events import StepNote
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.run_start import recorded_run
-from service.store.records import UnknownRunError
+from service.store.records import NewArtefact, UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until
 from tests.support.record.outsider import tamper
+from tests.support.record.store import captured, start_run
 from tests.support.recorded.large_run import SMALL, Sizes, digest_of, write_large_run
 from tests.support.runs.recorded_run import record_run
 
@@ -201,6 +202,18 @@ def test_artefacts_are_found_by_every_property(store: Store, run: str) -> None:
         assert last.page == last.pages
         with pytest.raises(UnknownRunError):
             search.one_artefact(connection, run, "'; DROP TABLE artefacts")
+
+
+@pytest.mark.parametrize(("q", "found"), [("Übersicht", 1), ("ÜBERSICHT", 1), ("bersicht.JPG", 1), ("Ubersicht", 0)])
+def test_an_artefact_is_found_by_a_name_with_letters_of_any_language(tmp_path: Path, q: str, found: int) -> None:
+    with Store.open(tmp_path / "data") as store:
+        run = start_run(store)
+        ref = store.put_bytes(b"x", kind="image", media_type="image/jpeg", original_name="Übersicht.jpg")
+        store.record(
+            run, [captured(ref, "v1")], actor="camera", artefacts=[NewArtefact(ref, "camera", "step", 1, "v1")]
+        )
+        with store.database.reading() as connection:
+            assert search.artefacts_page(connection, run, ArtefactFilter(q=q)).count == found
 
 
 def test_provenance_runs_from_scans_to_the_registration(tmp_path: Path) -> None:
