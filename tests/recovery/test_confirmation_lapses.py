@@ -279,8 +279,8 @@ def test_each_try_that_begins_by_itself_says_why_and_when(begin: Callable[[str],
     bench.operator.on_attend = attend
     assert bench.run().status == "completed"
     at = [event.at_utc for event in bench.store.events(bench.run_id) if event.payload.kind == "viewpoint_failed"]
-    assert said[0] == f"v001 failed once: no file within 4 s; second try since {at[0][11:16]}, by itself"
-    assert said[1].startswith("v001 failed twice: no file within 4 s; third try at ")
-    assert said[2].startswith("v001 failed twice: no file within 4 s; third try since ")
+    assert said[0] == f"v001 failed once: no file within 4 s; try 2 since {at[0][11:16]}, by itself"
+    assert said[1].startswith("v001 failed twice: no file within 4 s; try 3 at ")
+    assert said[2].startswith("v001 failed twice: no file within 4 s; try 3 since ")
     assert any(line.startswith("v001 failed twice") for line in bench.operator.told)
     assert bench.state().steps["capture"].tries is None

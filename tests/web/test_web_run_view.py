@@ -283,16 +283,16 @@ def test_what_is_tried_again_by_itself_is_said_by_the_step_and_the_banner() -> N
     failed = ViewpointFailed(step=step, attempt=attempt, viewpoint="b001", error=why, message=message, skipped=False)
     log.append(failed)
     log.append(failed)
-    said = "b001 failed twice: no file within 46 s; third try since 00:00:00 UTC, by itself"
+    said = "b001 failed twice: no file within 46 s; try 3 since 00:00:00 UTC, by itself"
     assert view_of(log).tries == said
     for robot in ("moving", "standing", "not_connected"):
         snapshot = Snapshot(at_utc_s=1.8e9, doing="working", robot=robot)
         words = tries_words(log.protocol, log.state, time_here)
         assert f"{said}." in robot_banner(log.state, snapshot, 1.8e9, driven=True, tries=words).text
     log.append(StepFailed(step=step, attempt=attempt, error=why, message=message, recovery="retry"))
-    assert "third try at 00:00:01 UTC" in view_of(log).tries
+    assert "try 3 at 00:00:01 UTC" in view_of(log).tries
     log.append(StepRetried(step=step, attempt=attempt + 1, why="DeviceTimeoutError: no file within 46 s"))
-    assert "third try since" in view_of(log).tries
+    assert "try 3 since" in view_of(log).tries
     log.capture(["b001"])
     assert view_of(log).tries == ""
 

@@ -447,7 +447,7 @@ def name_problem(name: str) -> str:
 
 def _entry_problem(info: zipfile.ZipInfo) -> str:
     mode = info.external_attr >> 16
-    if info.is_dir() or (mode and not stat.S_ISREG(mode) and stat.S_IFMT(mode)):
+    if info.is_dir() or stat.S_IFMT(mode) not in (0, stat.S_IFREG):
         return "it is a folder, a link or a device, not a file"
     if info.flag_bits & 1:
         return "it is encrypted"

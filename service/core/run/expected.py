@@ -142,12 +142,11 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 _TIMES = ("never", "once", "twice")
 
 
 def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str] = time_utc) -> str:
-    """Return `b001 failed twice: no file within 46 s; third try at 20:41:07 UTC` while the run tries again by itself.
+    """Return `b001 failed twice: no file within 46 s; try 3 at 20:41:07 UTC` while the run tries again by itself.
 
     The text is "" where nothing has failed, or where a person decides whether there is another try.
 
@@ -164,18 +163,14 @@ def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str]
             return ""
         wait = timedelta(seconds=protocol.step(now.step).recovery.wait_s)
         begins_utc = (datetime.fromisoformat(now.failure.at_utc or tries.at_utc) + wait).isoformat()
-        return f"{failed_words(tries)}; {_ordinal(tries.times + 1)} try at {clock(begins_utc)}, by itself"
+        return f"{failed_words(tries)}; try {tries.times + 1} at {clock(begins_utc)}, by itself"
     if now.phase != "running":
         return ""
     since_utc = max(tries.at_utc, now.work_began_utc)
-    return f"{failed_words(tries)}; {_ordinal(tries.times + 1)} try since {clock(since_utc)}, by itself"
+    return f"{failed_words(tries)}; try {tries.times + 1} since {clock(since_utc)}, by itself"
 
 
 def failed_words(tries: FailedTries) -> str:
     """Return `b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
     times = _TIMES[tries.times] if tries.times < len(_TIMES) else f"{tries.times} times"
     return f"{tries.what or 'The step'} failed {times}: {what_of(tries.message)}"
-
-
-def _ordinal(number: int) -> str:
-    return _ORDINALS[number - 1] if number <= len(_ORDINALS) else f"{number}th"
