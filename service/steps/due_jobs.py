@@ -15,8 +15,8 @@ from service.core.protocol.models import Protocol, Step
 from service.core.run.state import LATER, WAITED, RunState
 from service.steps.context import JobRequest
 from service.steps.front_end import early_matches
+from service.steps.registration import RegistrationParams, evaluated_step, evaluations_of
 from service.steps.registration_jobs import RegistrationJobs, Task, name_of, recorded_registration_jobs
-from service.steps.registration_sources import WantedRegistrations, evaluated_step, evaluations_of
 from service.store.records import NewJob
 
 
@@ -238,7 +238,7 @@ def _left_of(
     clock: _JobTimes,
 ) -> list[PendingResult]:
     """Return the missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
-    wanted = WantedRegistrations.of(step.params)
+    wanted = step.params_as(RegistrationParams)
     evaluations = {} if evaluation is None else evaluation_tasks(state, evaluation, found)
     free_s = [0.0] * clock.cores
     ready_s: dict[tuple[str, str], float] = {}

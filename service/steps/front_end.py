@@ -6,32 +6,28 @@ pairs to match early follow from the planned viewpoints.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 import numpy as np
 
 from service.computations import calibrate, features, match
-from service.computations.features import FrontEndArguments, SfmEffort
+from service.computations.features import SfmEffort
 from service.computations.kind import read_part
-from service.computations.records import Camera, ImageFile
+from service.computations.records import ImageFile
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
-from service.core.jobs import Jobs, job_key
+from service.core.jobs import job_key
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import EARLY, JobState, RunState
-from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import EarlierAnswer, earlier_answer
-from service.steps.registration_sources import WantedRegistrations
+from service.steps.context import EarlierAnswer, JobRequest, StepContext
+from service.steps.registration import RegistrationParams
 from service.steps.viewpoints import Viewpoint
 from service.store.records import NewJob
 
-T = TypeVar("T")
 _SOURCES_OF_IMAGES = frozenset({"colmap", "glomap", "hybrid", "triangulated"})
-IMAGES_A_JOB, PAIRS_A_JOB = 8, 100  # in the jobs that complete them
 
 
 @dataclass
@@ -50,12 +46,12 @@ class EarlyFeatures:
         registration = _registration_of(context.protocol, context.step.id)
         if registration is None:
             return None
-        wanted = WantedRegistrations.of(registration.params)
+        wanted = registration.params_as(RegistrationParams)
         try:
-            camera = earlier_answer(context, wanted.calibration, calibrate.KIND)
+            camera = context.earlier_answer(wanted.calibration, calibrate.KIND)
         except ConfigurationError:
             return None
-        effort = wanted.structure_from_motion
+        effort = wanted.structure_from_motion.effort
         options = SfmOptions(**effort.set_fields())
         nominal = context.devices.nominal_T_flange_camera()
         neighbours: dict[str, list[str]] = {}
@@ -91,14 +87,14 @@ def _registration_of(protocol: Protocol, capture: str) -> Step | None:
     """Return the step that will register the images of a capture by their features."""
     for step in protocol.steps:
         if step.gives == "registrations":
-            wanted = WantedRegistrations.of(step.params)
+            wanted = step.params_as(RegistrationParams)
             if capture in wanted.captures and _SOURCES_OF_IMAGES.intersection(wanted.poses):
                 return step
     return None
 
 
 def _taken(
-    context: StepContext, wanted: WantedRegistrations, station: str, nominal: Transform
+    context: StepContext, wanted: RegistrationParams, station: str, nominal: Transform
 ) -> dict[str, Transform]:
     """Return the approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
     earlier = [step for step in wanted.captures if step != context.step.id]
@@ -139,44 +135,6 @@ def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
     return jobs
 
 
-# --- use by the registration ---------------------------------------------------------------------------------------
-
-
-@dataclass
-class EarlyJobs:
-    """Early jobs of one camera and effort; some may not have finished."""
-
-    features: dict[str, JobState] = field(default_factory=dict[str, JobState])  # by the image's hash
-    matches: list[JobState] = field(default_factory=list[JobState])
-
-    def matching(self, features: Mapping[str, str]) -> list[JobState]:
-        """Return the jobs that matched exactly these features; `features` maps viewpoints to hashes of files."""
-        return [
-            job
-            for job in self.matches
-            if read_part(match.PairsToMatch, job.arguments).features.items() <= features.items()
-        ]
-
-
-def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: SfmEffort) -> EarlyJobs:
-    """Return the jobs that computed features and matches with this camera and effort while the images arrived."""
-    early = EarlyJobs()
-    for step in state.steps.values():
-        for job in step.jobs.values():
-            if job.priority != EARLY or job.kind not in ("features", "match"):
-                continue
-            if job.status == "failed":
-                continue
-            shared = read_part(FrontEndArguments, job.arguments, jobs)
-            if shared.effort.plain() != effort.plain() or shared.camera.plain() != camera.plain():
-                continue
-            if job.kind == "features":
-                early.features[_image_of(job).sha256] = job
-            else:
-                early.matches.append(job)
-    return early
-
-
 def _asked_of(job: JobState) -> features.ImagesToMatch:
     return read_part(features.ImagesToMatch, job.arguments)
 
@@ -184,9 +142,3 @@ def _asked_of(job: JobState) -> features.ImagesToMatch:
 def _image_of(job: JobState) -> ImageFile:
     """Return the image of an early job on features, which has only one."""
     return _asked_of(job).images[0]
-
-
-def chunks(items: Iterable[T], size: int) -> list[list[T]]:
-    """Return the items in order, in lists of at most `size`."""
-    listed = list(items)
-    return [listed[i : i + size] for i in range(0, len(listed), size)]

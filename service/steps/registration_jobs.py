@@ -6,27 +6,39 @@ job, so that results still arrive when no process drives the run any more.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import groupby
+from typing import Any, TypeVar
 
 import numpy as np
 
-from service.computations import detect_spheres, job_kinds
-from service.computations.features import ImagesToMatch
+from service.computations import detect_spheres, further_camera, job_kinds
+from service.computations.features import FrontEndArguments, ImagesToMatch, SfmEffort
 from service.computations.kind import JobRecord, read_part
 from service.computations.match import PairsToMatch
-from service.computations.records import ImageFile, ImagesCamera, PosedPhotograph
+from service.computations.records import Camera, ImageFile, ImagesCamera, PosedPhotograph
 from service.compute.sfm.options import SfmOptions, pairs_of
-from service.core.jobs import Reference, arguments_name, jobs_of, newest_job, resolve
+from service.core.jobs import Jobs, Reference, arguments_name, jobs_of, newest_job, resolve
 from service.core.protocol.models import Protocol, Step
-from service.core.run.state import LATER, REDUCED, WAITED, JobState, RunState
-from service.steps.context import JobRequest
-from service.steps.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
-from service.steps.registration_sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
+from service.core.records.events import FurtherExposure, ViewpointCaptured
+from service.core.run.state import EARLY, LATER, REDUCED, WAITED, JobState, RunState
+from service.steps.context import JobRequest, JobResult, StepContext
+from service.steps.registration import (
+    PLANNED,
+    QUICK,
+    RegistrationParams,
+    decisive,
+    developed,
+    exposure_of,
+    most_preferred,
+    posed,
+)
 
+T = TypeVar("T")
 _REDUCED = ("reduced_to", "full_camera")  # arguments of jobs on reduced images; the second one in old runs only
 _SEARCH_ONLY = ("detector", "colour", "developed")  # arguments of the search for outlines alone
+_IMAGES_A_JOB, _PAIRS_A_JOB = 8, 100  # in the jobs that complete features and matches
 _MAPPERS = {"colmap": "incremental", "glomap": "global", "triangulated": "triangulated"}
 
 
@@ -66,7 +78,7 @@ def registration_jobs(
         outlines: the job that detects the spheres; the arguments of all other jobs derive from its arguments.
         root: the name of that job; jobs that use other images have another root in their names.
     """
-    wanted = WantedRegistrations.of(step.params)
+    wanted = step.params_as(RegistrationParams)
     plan = _Plan(state, step.id, wanted, outlines, root)
     urgent = set(waited)
     arrived: dict[str, JobState] = {}
@@ -103,7 +115,7 @@ class _Plan:
 
     state: RunState
     step: str
-    wanted: WantedRegistrations
+    wanted: RegistrationParams
     outlines: JobRequest
     root: str
     tasks: dict[tuple[str, str], Task] = field(default_factory=dict[tuple[str, str], Task])
@@ -177,7 +189,7 @@ class _Plan:
             **shared,
             **pieces,
             "mappers": [mapper],
-            "effort": self.wanted.structure_from_motion.plain(),
+            "effort": self.wanted.structure_from_motion.effort.plain(),
             "prior": None if prior is None else prior.record(),
         }
         made = self._need("structure_from_motion", mapper, size, arguments)
@@ -188,16 +200,16 @@ class _Plan:
 
     def _pieces(self, size: str, shared: Mapping[str, Any], prior: Reference | None) -> dict[str, Any] | None:
         """Return features and matches as arguments, and those computed while images arrived; None until all exist."""
-        effort = self.wanted.structure_from_motion
+        effort = self.wanted.structure_from_motion.effort
         common = {**_copied(shared, "camera"), "effort": effort.plain(), **_copied(shared, *_REDUCED)}
         images = read_part(_Images, shared).images
         camera = read_part(ImagesCamera, shared, self.jobs).camera
-        early = EarlyJobs() if size else found_early(self.state, self.jobs, camera, effort)
+        early = _EarlyJobs() if size else _found_early(self.state, self.jobs, camera, effort)
         jobs: list[JobState | None] = [
             early.features[image.sha256] for image in images if image.sha256 in early.features
         ]
         rest = [image for image in images if image.sha256 not in early.features]
-        for some in chunks(rest, IMAGES_A_JOB):
+        for some in _chunks(rest, _IMAGES_A_JOB):
             what = arguments_name({"images": [image.sha256 for image in some]})
             files = [ImageFile(viewpoint=image.viewpoint, sha256=image.sha256).plain() for image in some]
             jobs.append(self._need("features", what, size, {**common, "images": files}))
@@ -214,7 +226,7 @@ class _Plan:
         known = {} if prior is None else {name: np.array(T) for name, T in resolve(prior.record(), self.jobs).items()}
         options = SfmOptions(**effort.set_fields())
         left = [pair for pair in pairs_of(features, known or None, options) if pair not in done]
-        for pairs in chunks(left, PAIRS_A_JOB):
+        for pairs in _chunks(left, _PAIRS_A_JOB):
             mine = {name: features[name] for pair in pairs for name in pair}
             listed = [list(pair) for pair in pairs]
             what = arguments_name({"pairs": listed})
@@ -271,6 +283,45 @@ def _pixels(size: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+@dataclass
+class _EarlyJobs:
+    """Early jobs of one camera and effort; some may not have finished."""
+
+    features: dict[str, JobState] = field(default_factory=dict[str, JobState])  # by the image's hash
+    matches: list[JobState] = field(default_factory=list[JobState])
+
+    def matching(self, features: Mapping[str, str]) -> list[JobState]:
+        """Return the jobs that matched exactly these features; `features` maps viewpoints to hashes of files."""
+        return [
+            job for job in self.matches if read_part(PairsToMatch, job.arguments).features.items() <= features.items()
+        ]
+
+
+def _found_early(state: RunState, jobs: Jobs, camera: Camera, effort: SfmEffort) -> _EarlyJobs:
+    """Return the jobs that computed features and matches with this camera and effort while the images arrived."""
+    early = _EarlyJobs()
+    for step in state.steps.values():
+        for job in step.jobs.values():
+            if job.priority != EARLY or job.kind not in ("features", "match"):
+                continue
+            if job.status == "failed":
+                continue
+            shared = read_part(FrontEndArguments, job.arguments, jobs)
+            if shared.effort.plain() != effort.plain() or shared.camera.plain() != camera.plain():
+                continue
+            if job.kind == "features":
+                early.features[read_part(ImagesToMatch, job.arguments).images[0].sha256] = job
+            else:
+                early.matches.append(job)
+    return early
+
+
+def _chunks(items: Iterable[T], size: int) -> list[list[T]]:
+    """Return the items in order, in lists of at most `size`."""
+    listed = list(items)
+    return [listed[i : i + size] for i in range(0, len(listed), size)]
+
+
 def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) -> RegistrationJobs | None:
     """Return the jobs of a step's registrations according to the record; None for a step that has not started them.
 
@@ -292,3 +343,78 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
 def name_of(job: JobState) -> str:
     """Return the part of a job's key that distinguishes it from other jobs of its kind."""
     return job.idempotency_key.split("/")[3]
+
+
+# --- further cameras -----------------------------------------------------------------------------------------------
+
+_SPHERES = ("spheres_m", "sphere_covariance_m2", "radius_m", "colour")  # arguments of the search for outlines
+
+_OF_REGISTRATION = ("T_world_scan", "covariance", "T_scan_camera", "camera", "outlines")  # parts of its answer
+_OF_LENS = ("intrinsics_covariance",)
+
+
+def locate_further_cameras(
+    context: StepContext,
+    images_of: Iterable[str],
+    outlines: JobRequest,
+    registered: Mapping[str, JobState],
+    *,
+    on_raw: bool,
+) -> Mapping[str, JobResult]:
+    """Locate each further camera that exposed in these capture steps; return the worker's answers by camera name.
+
+    Args:
+        context: the registration step's surroundings: devices, evidence, clock.
+        images_of: the capture steps' ids.
+        outlines: the search for spheres in the first camera's images, which has the arguments on the spheres.
+        registered: the finished job of each registration of those images.
+        on_raw: true to measure in developed raw files, for a camera that wrote one with every image.
+    """
+    exposures = sorted(_exposures(context, images_of), key=lambda exposure: exposure[1].device)
+    requests = {
+        device: _of_camera(context, [*group], outlines, registered, on_raw=on_raw)
+        for device, group in groupby(exposures, lambda exposure: exposure[1].device)
+    }
+    return dict(zip(requests, context.evidence.run_jobs(*requests.values()), strict=True)) if requests else {}
+
+
+def _exposures(context: StepContext, images_of: Iterable[str]) -> list[tuple[str, FurtherExposure]]:
+    """Return (viewpoint, exposure) of every usable view."""
+    return [
+        (capture.viewpoint, exposure)
+        for step in images_of
+        for capture in context.evidence.captures(step)
+        if isinstance(capture, ViewpointCaptured) and all(capture.verdicts.values())
+        for exposure in capture.further
+    ]
+
+
+def _of_camera(
+    context: StepContext,
+    exposures: Sequence[tuple[str, FurtherExposure]],
+    outlines: JobRequest,
+    registered: Mapping[str, JobState],
+    *,
+    on_raw: bool,
+) -> JobRequest:
+    """Return the job for one camera; its newest calibration counts."""
+    last = exposures[-1][1]
+    recorded = outlines.arguments
+    arguments: dict[str, object] = {
+        "device": last.device,
+        "mounted": last.mounted,
+        "images": [
+            ImageFile(viewpoint=viewpoint, sha256=exposure.artefacts[0].sha256).plain()
+            for viewpoint, exposure in exposures
+        ],
+        "calibration": last.calibration.sha256,
+        **{name: recorded[name] for name in _SPHERES if name in recorded},
+    }
+    raws = [exposure_of(viewpoint, exposure.artefacts) for viewpoint, exposure in exposures]
+    if on_raw and None not in raws:
+        arguments["developed"] = developed(context, [raw for raw in raws if raw is not None])
+    if last.mounted == "rigid":
+        job = registered[most_preferred(registered)]
+        first = {name: Reference(job.job, f"result/{name}").record() for name in _OF_REGISTRATION}
+        arguments["first"] = first | {name: recorded[name] for name in _OF_LENS if name in recorded}
+    return JobRequest(further_camera.KIND.name, arguments, version=further_camera.KIND.version)

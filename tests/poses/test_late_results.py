@@ -46,7 +46,7 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.steps.due_jobs import missing_results
-from service.steps.registration_sources import PLANNED
+from service.steps.registration import PLANNED
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -22,8 +22,8 @@ from service.followed_run import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.steps.due_jobs import due, missing_results
+from service.steps.registration import PLANNED, decisive
 from service.steps.registration_jobs import recorded_registration_jobs
-from service.steps.registration_sources import PLANNED, decisive
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify

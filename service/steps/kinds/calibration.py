@@ -21,10 +21,19 @@ from service.core.protocol.step_params import (
 from service.core.records.events import Record
 from service.core.units import metres
 from service.steps.board_poses import BoardPoses
-from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
-from service.steps.inputs import EarlierAnswer, captured_images, earlier_answer
+from service.steps.context import (
+    ROBOT_MOVES,
+    Announcement,
+    EarlierAnswer,
+    JobRequest,
+    JobResult,
+    StepContext,
+    StepKind,
+    StepOutcome,
+)
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
 from service.steps.optics import departing_images, optics_departures
+from service.steps.registration import captured_images
 from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 
 if TYPE_CHECKING:
@@ -190,7 +199,7 @@ def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Ans
         raise ConfigurationError(
             "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
         )
-    return earlier_answer(context, params.intrinsics_of, calibrate.KIND)
+    return context.earlier_answer(params.intrinsics_of, calibrate.KIND)
 
 
 def _board_capture(
