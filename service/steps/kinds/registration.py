@@ -80,8 +80,8 @@ class Result(Record):
 def execute(context: StepContext, params: RegistrationParams) -> StepOutcome:
     """Detect the spheres, and register every source that the step waits for; the others are enqueued as well."""
     waited = decisive(context.protocol, context.step)
-    outlines = search_for_spheres(context, params)
-    root = arguments_name(outlines.arguments)
+    search = search_for_spheres(context, params)
+    root = arguments_name(search.arguments)
     later = [name for name in params.registrations if name not in waited]
     context.note(PLANNED, decisive=list(waited), later=later)
     seen = -1
@@ -92,7 +92,7 @@ def execute(context: StepContext, params: RegistrationParams) -> StepOutcome:
             context.wait(0.2)
             continue
         seen = state.seq
-        found = registration_jobs(state, context.step, waited, outlines, root)
+        found = registration_jobs(state, context.step, waited, search, root)
         for name in waited:
             if name in found.failed:
                 raise ComputeError(
@@ -106,9 +106,7 @@ def execute(context: StepContext, params: RegistrationParams) -> StepOutcome:
             _tell_findings(context, outcome)
             return _with_further_cameras(
                 outcome,
-                locate_further_cameras(
-                    context, params.images_of, outlines, found.arrived, on_raw=params.measure_on == "raw"
-                ),
+                locate_further_cameras(context, params, search, found.arrived),
             )
         for task in found.due:
             context.evidence.enqueue(task.request, task.name)
