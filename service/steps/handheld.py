@@ -23,8 +23,8 @@ from service.steps.context import JobRequest, StepContext, StepOutcome
 from service.steps.exposure import wanted_settings
 from service.steps.live_numbers import COVERAGE, ERROR, CoverageRule, seen_words
 from service.steps.measures import Count, PredictedMeasures, Share
-from service.steps.optics import departing_images, optics_departures
 from service.steps.registration import held_views
+from service.steps.retakes import departing_images, optics_departures
 
 
 class Ring(Record):
