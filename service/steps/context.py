@@ -1,4 +1,4 @@
-"""The interface of a step: its kind, the context in which it runs, and its outcome."""
+"""The interface of a step: its kind, the context in which it runs, what earlier steps left to it, and its outcome."""
 
 from __future__ import annotations
 
