@@ -36,9 +36,9 @@ from service.core.geometry import Array, Transform, apply, inverse
 from service.core.protocol.models import Motion
 from service.rig import CollisionSection, LensSection
 from service.steps.board_plan import START, PlannedBoard, Planner, Why, nominal_board, nominal_camera
-from service.steps.board_poses import BoardPoses
 from service.steps.context import StationLayout
-from service.steps.planning import ArmAtStation, usual_posture
+from service.steps.motion import ArmAtStation, usual_posture
+from service.steps.viewpoints import BoardPoses
 from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"

@@ -166,7 +166,7 @@ def _add_job(graph: Graph, row: Any) -> None:
 def _referred_to(graph: Graph, arguments: Any, key: str) -> set[str]:
     """Return the nodes of jobs whose results the arguments refer to. Files that they refer to are added as edges."""
     results: set[str] = set()
-    for reference in references_in(arguments):
+    for _, reference in references_in(arguments):
         if isinstance(reference, Reference):
             sources = {graph.jobs[reference.job]} if reference.job in graph.jobs else set[str]()
         else:
@@ -281,7 +281,7 @@ def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Ar
 def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]:
     """Yield the files of the many earlier jobs that a job refers to at once."""
     enqueued = job.record(JobEnqueued)
-    for each in references_in({} if enqueued is None else enqueued.arguments):
+    for _, each in references_in({} if enqueued is None else enqueued.arguments):
         if isinstance(each, Each) and each.field.startswith("artefacts/"):
             for stem in each.jobs:
                 yield from connection.execute(

@@ -30,8 +30,8 @@ from service.run_start import recorded_run
 from service.station import layout_of
 from service.steps import params_models
 from service.steps.kinds import calibration
+from service.steps.motion import StepPlan
 from service.steps.plan_preview import BoardPreview, preview_board_poses, preview_plans
-from service.steps.planning import StepPlan
 from service.store.store import Store
 
 plan_app = typer.Typer(no_args_is_help=True, help="Plan viewpoints, before and during a capture.")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
 from typing import Any, cast
@@ -129,17 +129,20 @@ def read_reference(value: object) -> Reference | Each | None:
     return None
 
 
-def references_in(value: object) -> Iterator[Reference | Each]:
-    """Yield every reference anywhere within recorded arguments."""
+def references_in(value: object, at: str = "") -> Iterator[tuple[str, Reference | Each]]:
+    """Yield every reference anywhere within recorded arguments, after its field (`further_arms/0/arm_correction`)."""
     found = read_reference(value)
     if found is not None:
-        yield found
-    elif isinstance(value, Mapping):
-        for item in cast("Mapping[str, Any]", value).values():
-            yield from references_in(item)
+        yield at, found
+        return
+    items: Iterable[tuple[object, Any]] = ()
+    if isinstance(value, Mapping):
+        items = cast("Mapping[str, Any]", value).items()
     elif isinstance(value, list | tuple):
-        for item in cast("Sequence[Any]", value):
-            yield from references_in(item)
+        items = enumerate(cast("Sequence[Any]", value))
+    for name, item in items:
+        if isinstance(item, Mapping | list | tuple):
+            yield from references_in(item, f"{at}/{name}" if at else str(name))
 
 
 def resolve(value: Any, jobs: Jobs) -> Any:

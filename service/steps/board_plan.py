@@ -24,9 +24,9 @@ from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import metres
 from service.rig import LensSection
-from service.steps.board_poses import BoardPoses
 from service.steps.context import StationLayout
 from service.steps.notes import BoardPrediction
+from service.steps.viewpoints import BoardPoses
 
 Why = Literal["first", "start", "rest", "replacement", "mend"]
 #: The first image is taken from farther away and nearly from above, because the board's place is only roughly known.

@@ -1,4 +1,4 @@
-"""The interface of a step: its kind, the context in which it runs, and its outcome."""
+"""The interface of a step: its kind, the context in which it runs, what earlier steps left to it, and its outcome."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, Self, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from drivers.interfaces import (
     Abandoned,
@@ -22,8 +24,8 @@ from drivers.interfaces import (
 from service.computations import term
 from service.computations.kind import JobKind, JobRecord
 from service.computations.memory_grants import waiting_for_memory
-from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
-from service.core.jobs import Each, Reference, arguments_name, job_key
+from service.core.errors import ComputeError, ConfigurationError, IntegrityError, OrthocaptureError
+from service.core.jobs import Each, Reference, answered_by, arguments_name, job_key
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
 from service.core.protocol.step_params import StepParams
@@ -40,6 +42,8 @@ from service.store.runs import RunLease
 
 P = TypeVar("P", bound=StepParams)
 A = TypeVar("A", bound=JobRecord)
+R = TypeVar("R", bound=JobRecord)
+M = TypeVar("M", bound=BaseModel)
 _NO_REFERENCES: Mapping[str, Reference | Each | None] = {}
 
 
@@ -338,6 +342,19 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True)
+class EarlierAnswer(Generic[R]):
+    """The answer that became an earlier step's result, and the job that computed it."""
+
+    answer: R
+    job: JobState | None  # None: no job of this run computed it
+
+    def reference(self, field: str) -> Reference | None:
+        """Refer to a part of the answer (`details/spheres/*/covariance_m2`; "": all of it); None without a job."""
+        path = f"result/{field}" if field else "result"
+        return None if self.job is None else Reference(self.job.job, path)
+
+
+@dataclass(frozen=True, slots=True)
 class StepContext:
     """Everything that a step may touch."""
 
@@ -363,6 +380,63 @@ class StepContext:
     def state(self) -> StepState:
         """The folded state of this step, as of the start of this execution."""
         return self.run.steps[self.step.id]
+
+    def earlier_answer(self, step_id: str, kind: JobKind[Any, R]) -> EarlierAnswer[R]:
+        """Return the result of an earlier step, as the answer of a kind of job.
+
+        Raises ConfigurationError if it is not one.
+        """
+        result = self._result_of(step_id)
+        try:
+            answer = kind.read_answer(result)
+        except IntegrityError as error:
+            raise ConfigurationError(
+                f"step {self.step.id!r} needs {kind.words} of step {step_id!r}, which has none",
+                where=f"step {self.step.id}",
+                remedy="Name a step in the protocol that computes it",
+            ) from error
+        return EarlierAnswer(answer, answered_by(self.run.steps[step_id]))
+
+    def earlier_result(self, step_id: str, model: type[M]) -> M:
+        """Return the Result of an earlier step of a known kind.
+
+        Raises ConfigurationError if it has none, or another.
+        """
+        result = self._result_of(step_id)
+        try:
+            return model.model_validate(result)
+        except ValidationError as error:
+            raise ConfigurationError(
+                f"step {self.step.id!r} cannot use the result of step {step_id!r}, a step of another kind",
+                where=f"step {self.step.id}",
+                remedy="Correct the protocol",
+            ) from error
+
+    def earlier_artefact(self, step_id: str, kind: str) -> ArtefactRef:
+        """Return the newest artefact of one kind that an earlier step produced.
+
+        Raises ConfigurationError if it has none.
+        """
+        state = self.run.steps.get(step_id)
+        found = [ref for ref in (state.artefacts if state else ()) if ref.kind == kind]
+        if not found:
+            raise ConfigurationError(
+                f"step {self.step.id!r} needs a {kind} of step {step_id!r}, which has none",
+                where=f"step {self.step.id}",
+                remedy=f"Pass step {step_id!r} first, or correct the protocol",
+            )
+        return found[-1]
+
+    def _result_of(self, step_id: str) -> Mapping[str, Any]:
+        """Return the Result of an earlier step, as plain data; ConfigurationError if it has none."""
+        state = self.run.steps.get(step_id)
+        if state is None or not state.result:
+            raise ConfigurationError(
+                f"step {self.step.id!r} needs the result of step {step_id!r}, which has none",
+                where=f"step {self.step.id}",
+                remedy=f"Pass step {step_id!r} first, or correct the protocol",
+            )
+        return state.result
 
     def note(self, note: str, **data: Any) -> None:
         """Record a StepNote."""

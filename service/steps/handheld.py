@@ -21,10 +21,10 @@ from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
 from service.steps.context import JobRequest, StepContext, StepOutcome
 from service.steps.exposure import wanted_settings
-from service.steps.inputs import artefact_of, earlier_answer, held_views, intrinsics_covariance_of
 from service.steps.live_numbers import COVERAGE, ERROR, CoverageRule, seen_words
 from service.steps.measures import Count, PredictedMeasures, Share
-from service.steps.optics import departing_images, optics_departures
+from service.steps.registration import held_views
+from service.steps.retakes import departing_images, optics_departures
 
 
 class Ring(Record):
@@ -179,7 +179,7 @@ def _of_specimen(context: StepContext, params: Params) -> CommonArguments:
             remedy="Name the calibration step in `calibration`",
         )
     error, covers = (next((g for g in context.step.gates if g.measure == m), None) for m in (ERROR, COVERAGE))
-    calibration = earlier_answer(context, params.calibration, calibrate.KIND)
+    calibration = context.earlier_answer(params.calibration, calibrate.KIND)
     spheres, rough, spheres_from = _spheres(context, params)
     values = hand_view.SpecimenArguments(
         places=_places(params),
@@ -197,7 +197,7 @@ def _of_specimen(context: StepContext, params: Params) -> CommonArguments:
         scan_sigma_m=metres(params.scan_sigma_mm),
     )
     references = {"camera": calibration.reference("camera"), "spheres_m": spheres_from}
-    lens = intrinsics_covariance_of(calibration)
+    lens = calibration.answer.intrinsics_covariance
     if lens is not None:
         values = values.model_copy(update={"intrinsics_covariance": lens})
         references["intrinsics_covariance"] = calibration.reference("details/intrinsics/covariance")
@@ -215,7 +215,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
     for name in params.spheres_of:
         state = context.run.steps.get(name)
         if state is not None and state.result.get("spheres_m"):
-            found = earlier_answer(context, name, layout.KIND)
+            found = context.earlier_answer(name, layout.KIND)
             rough = context.protocol.step(name).gives == "rough_spheres"
             return found.answer.spheres_m, rough, found.reference("spheres_m")
     raise ConfigurationError(
@@ -351,7 +351,7 @@ class Guide:
             return None
         for name in self.params.spheres_of[:1]:
             try:
-                return artefact_of(self.context, name, "ct_mesh").sha256
+                return self.context.earlier_artefact(name, "ct_mesh").sha256
             except ConfigurationError:
                 return None
         return None

@@ -21,8 +21,8 @@ from service.core.records.events import FurtherExposure, Record, RecordedView, V
 from service.core.run.state import LIVE, JobState
 from service.core.units import metres, rad_of_mrad
 from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import artefact_of, earlier_answer, mounting_of, with_robot_pose
 from service.steps.notes import SPOILT, SUGGESTION, suggested_views
+from service.steps.registration import mounting_of, with_robot_pose
 from service.steps.retakes import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.viewpoints import Viewpoint
 
@@ -127,7 +127,7 @@ class LiveAnalysis:
             return None
         try:
             shared = SharedArguments.of(context, params)
-            mesh = artefact_of(context, params.spheres_of, "ct_mesh").sha256
+            mesh = context.earlier_artefact(params.spheres_of, "ct_mesh").sha256
         except ConfigurationError as error:
             context.note("no_live_numbers", why=str(error))
             context.tell(f"no numbers while capturing: {error}")
@@ -152,16 +152,16 @@ class LiveAnalysis:
             if sha256 in begun or not all(capture.verdicts.values()):
                 continue
             image = PosedPhotograph(viewpoint=capture.viewpoint, station=capture.station, sha256=sha256)
-            mounted = mounting_of(self.context, [self.params.hand_eye], [capture.station])
+            mounting, mounted_by = mounting_of(self.context, [self.params.hand_eye], [capture.station])
             earlier, looks = self._earlier()
             arguments = live_view.Arguments(
                 **self.shared.values.set_fields(),
-                **mounted.mounting.set_fields(),
+                **mounting.set_fields(),
                 image=with_robot_pose(image, capture),
                 surface=self._surface(),
                 earlier=earlier,
             )
-            references = {**self.shared.taken, **mounted.references, "earlier": looks}
+            references = {**self.shared.taken, **mounted_by, "earlier": looks}
             request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
             self.context.evidence.enqueue(request, sha256)
         look_at_further(self.context, self.shared.values.spheres_m, self.shared.values.radius_m, self.shared.taken)
@@ -386,9 +386,9 @@ class SharedArguments:
     @classmethod
     def of(cls, context: StepContext, params: LiveParams) -> SharedArguments:
         """Read the arguments from the results of earlier steps. Raises ConfigurationError if one is missing."""
-        scan = earlier_answer(context, params.spheres_of, locate_spheres.KIND)
-        calibration = earlier_answer(context, params.calibration, calibrate.KIND)
-        hand_eye = earlier_answer(context, params.hand_eye, calibrate.KIND)
+        scan = context.earlier_answer(params.spheres_of, locate_spheres.KIND)
+        calibration = context.earlier_answer(params.calibration, calibrate.KIND)
+        hand_eye = context.earlier_answer(params.hand_eye, calibrate.KIND)
         record = hand_eye.answer.hand_eye
         if record is None:
             raise ConfigurationError(

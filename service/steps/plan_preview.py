@@ -27,8 +27,8 @@ from service.steps.board_plan import (
 from service.steps.context import StationLayout
 from service.steps.kinds import calibration
 from service.steps.kinds.viewpoint_capture import Params
+from service.steps.motion import ArmAtStation, StepPlan, plan_station, usual_posture
 from service.steps.notes import BoardPrediction
-from service.steps.planning import ArmAtStation, StepPlan, plan_station, usual_posture
 from service.steps.viewpoints import plan_viewpoints
 
 

@@ -19,7 +19,7 @@ from service.core.text.checked_yaml import FieldPath, Plain, YamlProblem, field_
 from service.rig import Rig, RigDevice, RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
-from service.steps.registration_sources import WantedRegistrations, needing_mount
+from service.steps.registration import RegistrationParams, needing_mount
 
 # Section and field of the file → its credible range, and its unit.
 _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
@@ -45,7 +45,7 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
     return (
         None
         if registering is None or registering.gives != "registrations"
-        else kind.measures.declared_for(WantedRegistrations.of(registering.params).registrations)
+        else kind.measures.declared_for(registering.params_as(RegistrationParams).registrations)
     )
 
 
@@ -165,7 +165,7 @@ def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, s
     """Yield poses of an arm that a registration asks for although no step says how the arm held the camera."""
     if step.gives != "registrations":
         return
-    wanted = WantedRegistrations.of(step.params)
+    wanted = step.params_as(RegistrationParams)
     unknown = needing_mount(wanted.poses)
     carried = [name for name in wanted.captures if name in steps and steps[name].moves_robot]
     if wanted.hand_eye is None and unknown and carried:

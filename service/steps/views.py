@@ -37,8 +37,7 @@ from service.steps.exposure import (
     settings_of,
     wanted_settings,
 )
-from service.steps.motion import MotionLimits, move_and_settle, require_there, settle_criteria
-from service.steps.planning import StepPlan
+from service.steps.motion import MotionLimits, StepPlan, move_and_settle, require_there, settle_criteria
 from service.steps.retakes import taken_for_good
 from service.steps.viewpoints import Viewpoint, flange_target
 

@@ -30,8 +30,8 @@ from service.station import layout_of
 from service.steps import params_models
 from service.steps.context import StationLayout
 from service.steps.kinds import viewpoint_capture
+from service.steps.motion import ArmAtStation, usual_posture
 from service.steps.plan_preview import preview_plans
-from service.steps.planning import ArmAtStation, usual_posture
 from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 from simulators.scene.world import Scene
 

@@ -140,7 +140,7 @@ def test_end_to_end_carries_the_change_to_the_registration(
 def test_a_job_that_refers_to_earlier_answers_holds_none_of_their_numbers(referring: Path) -> None:
     run = read_run(referring / "data", "latest")
     (first,), (second,), (registered,) = (tuple(state.jobs.values()) for state in run.state.steps.values())
-    taken = {found.job for found in references_in(second.arguments) if isinstance(found, Reference)}
+    taken = {found.job for _, found in references_in(second.arguments) if isinstance(found, Reference)}
     assert taken == {first.job}
     assert len(json.dumps(registered.arguments["spheres_m"])) < 120
     assert resolve(registered.arguments, jobs_of(run.state))["spheres_m"] == second.result["spheres_m"]

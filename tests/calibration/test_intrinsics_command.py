@@ -25,7 +25,7 @@ from service.core.records.base import Moment
 from service.core.records.events import ViewpointCaptured
 from service.steps import params_models
 from service.steps.context import StepContext
-from service.steps.optics import departing_images, optics_departures
+from service.steps.retakes import departing_images, optics_departures
 from tests.support.boards.board_images import checkerboard, photograph
 
 CAMERA = CameraModel(900, 600, 1260, 1261, 452.0, 301.0, -0.045, 0.03, 4e-4, -5e-4)

@@ -29,7 +29,7 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
     of_scan = dataclasses.replace(of_scan, result=answer.result)
     jobs[of_scan.job] = of_scan
     images = with_located_images(of_scan, jobs).arguments["images"]
-    assert {found.job for found in references_in(images) if isinstance(found, Reference)} == {of_scan.job}
+    assert {found.job for _, found in references_in(images) if isinstance(found, Reference)} == {of_scan.job}
     in_ct, in_scan = (
         locate_spheres.KIND.read_answer(
             next(job for job in jobs.values() if job.idempotency_key.startswith(key)).result

@@ -46,7 +46,7 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.steps.due_jobs import missing_results
-from service.steps.registration_sources import PLANNED
+from service.steps.registration import PLANNED
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -56,7 +56,7 @@ from tests.support.processes.forked import Forked
 from tests.support.processes.waiting import until
 from tests.support.record.outsider import rows
 from tests.support.record.store import enqueue
-from tests.support.recorded.registration_record import registration_record
+from tests.support.recorded.registration_record import SPHERES, registration_record
 from tests.support.recorded.reported_run import evaluation
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
 
@@ -135,7 +135,7 @@ def record(folder: Path, store: Store) -> Run:
     run = Run(store, run_id, loaded.protocol)
     planned = StepNote(step="registration", attempt=1, note=PLANNED, data={"later": ["triangulated", "colmap"]})
     run.add(StepStarted(step="registration", attempt=1), planned)
-    run.job("detect_spheres", "registration", "root", 1, images=IMAGES, camera=CAMERA)
+    run.job("detect_spheres", "registration", "root", 1, images=IMAGES, camera=CAMERA, **SPHERES)
     run.measure("registration", {}, {"registrations": {"robot": registration_record("robot")}})
     run.add(StepPassed(step="registration", attempt=1), StepStarted(step="evaluation", attempt=1))
     judged = run.measure("evaluation", {"best_mean_radial_error_mm": 0.02}, table(robot=0.02))

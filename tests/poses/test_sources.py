@@ -12,6 +12,7 @@ import pytest
 from service.cli.status import status_record
 from service.core.gates.release import late_s, late_words
 from service.core.geometry import look_at
+from service.core.jobs import Reference
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
 from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished
 from service.core.run.fold import fold, initial_state
@@ -22,14 +23,14 @@ from service.followed_run import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.steps.due_jobs import due, missing_results
+from service.steps.registration import PLANNED, decisive
 from service.steps.registration_jobs import recorded_registration_jobs
-from service.steps.registration_sources import PLANNED, decisive
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.outlines import displayed_registration
 from tests.support.record.store import enqueue
-from tests.support.recorded.registration_record import registration_record
+from tests.support.recorded.registration_record import SPHERES, registration_record
 from tests.support.runs.computing_run import compute_jobs
 from tests.support.runs.recorded_run import record_run
 
@@ -90,7 +91,7 @@ class _Run:
         self.count = 0
 
     def _search(self) -> dict[str, Any]:
-        return {"images": IMAGES, "camera": CAMERA, "detector": "classical", "arm_correction": {"arm": "UR10e"}}
+        return {"images": IMAGES, "camera": CAMERA, "detector": "classical", **SPHERES}
 
     def due(self) -> list[NewJob]:
         return due(self.protocol, self.state)
@@ -102,14 +103,14 @@ class _Run:
                 f"j{self.count}", new.kind, new.attempt, 10 + self.count, new.idempotency_key, new.arguments,
                 priority=new.priority,
             )  # fmt: skip
-            self._put(new.step, job)
+            self.put(new.step, job)
 
     def finish(self, kind: str, *, status: str = "finished") -> None:
         """Finish every open job of a kind."""
         for step, now in self.state.steps.items():
             for job in now.jobs.values():
                 if job.kind == kind and job.status == "enqueued":
-                    self._put(step, self._done(job, status))
+                    self.put(step, self._done(job, status))
 
     def _done(self, job: JobState, status: str) -> JobState:
         images = job.arguments.get("images", IMAGES)
@@ -126,7 +127,7 @@ class _Run:
         result["full_camera"] = job.arguments.get("full_camera")
         return replace(job, status=status, artefacts=refs, result=result, message="said so", duration_s=2.0)
 
-    def _put(self, step: str, job: JobState) -> None:
+    def put(self, step: str, job: JobState) -> None:
         now = self.state.steps[step]
         changed = replace(now, jobs={**now.jobs, job.job: job})
         self.state = replace(self.state, steps={**self.state.steps, step: changed})
@@ -167,6 +168,28 @@ def test_each_job_is_due_when_its_input_is_there_and_once(tmp_path: Path) -> Non
     assert found is not None
     assert set(found.arrived) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
     assert run.due() == []
+
+
+def test_the_jobs_refer_to_earlier_answers_and_poses_as_reported_are_not_corrected() -> None:
+    correction = {"T_flange_camera": POSE, "arm": "UR10e", "dh_deltas": [[0.0] * 4] * 6, "observed": [1.0] * 6}
+    correction |= {"gear_cos_rad": [[0.0]] * 6, "gear_sin_rad": [[0.0]] * 6}
+    result = {"camera": CAMERA, "T_flange_camera": POSE, "hand_eye": {"arm_correction": correction}}
+    calibrated = JobState("cal", "calibrate", 1, 1, "calibration/0/calibrate/c/0", {}, "finished", result=result)
+    camera, corrected = Reference("cal", "result/camera"), Reference("cal", "result/hand_eye/arm_correction")
+    arm = {"T_flange_camera": POSE, "arm_correction": corrected.record(), "stations": ["station_2"]}
+    run = _Run(protocol())
+    run.put("camera_calibration", calibrated)
+    (search,) = run.state.steps["registration"].jobs.values()
+    arguments = {**search.arguments, "camera": camera.record(), "T_flange_camera": POSE}
+    arguments |= {"arm_correction": corrected.record(), "arm_stations": ["station_1"], "further_arms": [arm]}
+    run.put("registration", replace(search, arguments=arguments))
+    run.finish("detect_spheres")
+    reported, as_corrected = (job.arguments for job in run.due())
+    assert as_corrected["camera"] == reported["camera"] == camera.record()
+    assert as_corrected["arm_correction"] == corrected.record()
+    assert as_corrected["further_arms"] == [arm]
+    assert reported["arm_correction"] is None
+    assert reported["further_arms"] == [{**arm, "arm_correction": None}]
 
 
 def test_a_way_that_failed_is_said_to_have_failed_and_not_tried_again_by_itself() -> None:

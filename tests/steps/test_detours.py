@@ -12,7 +12,7 @@ import pytest
 
 from service.core.geometry import Array
 from service.core.records.events import OperatorAction, ViewpointFailed
-from service.steps import planning
+from service.steps import motion
 from service.steps.kinds import viewpoint_capture
 from service.steps.viewpoints import Viewpoint, flange_target
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, bench_store
@@ -29,8 +29,8 @@ def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
 def by_a_detour(monkeypatch: pytest.MonkeyPatch, name: str, begins_rad: Callable[[], Array]) -> None:
     """Let the plan reach this viewpoint through BETWEEN_RAD, from where `begins_rad` says."""
 
-    def plan_step(*args: Any, **kwargs: Any) -> planning.StepPlan:
-        plan = planning.plan_step(*args, **kwargs)
+    def plan_step(*args: Any, **kwargs: Any) -> motion.StepPlan:
+        plan = motion.plan_step(*args, **kwargs)
         way = np.stack([begins_rad(), *BETWEEN_RAD])
         viewpoints = tuple(replace(v, way_rad=way, from_rad=way[0]) if v.name == name else v for v in plan.viewpoints)
         return replace(plan, viewpoints=viewpoints)
@@ -77,7 +77,7 @@ def test_a_way_from_elsewhere_is_not_begun_but_planned_anew_from_where_the_arm_s
     by_a_detour(monkeypatch, VIEWS[1], begins_rad)
     detoured = viewpoint_capture.plan_step
 
-    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> planning.StepPlan:
+    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> motion.StepPlan:
         planned.append([viewpoint.name for viewpoint in viewpoints])
         return detoured(context, viewpoints, *more, **named)
 
@@ -97,9 +97,9 @@ def test_a_viewpoint_that_is_taken_again_is_planned_from_where_the_arm_stands(
     planned: list[list[str]] = []
     here: list[Array] = []
 
-    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> planning.StepPlan:
+    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> motion.StepPlan:
         """A plan as of an arm of known kinematics: each way begins where the one before it ends."""
-        plan = planning.plan_step(context, viewpoints, *more, **named)
+        plan = motion.plan_step(context, viewpoints, *more, **named)
         planned.append([viewpoint.name for viewpoint in viewpoints])
         here[:] = [bench.rig.arm.state().sample.joints_rad]
         for viewpoint in viewpoints:

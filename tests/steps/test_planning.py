@@ -44,8 +44,8 @@ from service.station import layout_of
 from service.steps import params_models
 from service.steps.context import StationLayout
 from service.steps.kinds import viewpoint_capture
+from service.steps.motion import ArmAtStation, usual_posture
 from service.steps.plan_preview import preview_board_poses, preview_plans
-from service.steps.planning import ArmAtStation, usual_posture
 from service.steps.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.core.records.events import StepNote
-from service.steps import planning
+from service.steps import motion
 from service.steps.kinds import viewpoint_capture
 from service.steps.viewpoints import Viewpoint
 from tests.support.rig.bench_rig import answer, other_settings
@@ -30,9 +30,9 @@ def test_images_with_other_settings_are_offered_to_be_taken_again_and_only_those
     turned = {2}
     planned: list[list[str]] = []
 
-    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> planning.StepPlan:
+    def plan_step(context: Any, viewpoints: Sequence[Viewpoint], *more: Any, **named: Any) -> motion.StepPlan:
         planned.append([viewpoint.name for viewpoint in viewpoints])
-        return planning.plan_step(context, viewpoints, *more, **named)
+        return motion.plan_step(context, viewpoints, *more, **named)
 
     monkeypatch.setattr(viewpoint_capture, "plan_step", plan_step)
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from service.computations.calibrate.records import BoardSeen, HandEye, Intrinsics, KnownBoard
 from service.computations.kind import Demand, JobKind, JobRecord
-from service.computations.records import BoardSize, Camera, Hash, Matrix, PosedPhotograph
+from service.computations.records import BoardSize, Camera, Hash, Matrix, ParameterCovariance, PosedPhotograph
 
 
 class Arguments(BoardSize):
@@ -57,6 +57,11 @@ class Answer(JobRecord):
     T_flange_camera: Matrix | None = None
     T_base_board: Matrix | None = None
     hand_eye: HandEye | None = None
+
+    @property
+    def intrinsics_covariance(self) -> ParameterCovariance | None:
+        """The covariance of the camera's parameters, with their names; None if it was not computed."""
+        return None if self.details.intrinsics is None else self.details.intrinsics.covariance
 
 
 KIND = JobKind(

@@ -20,12 +20,20 @@ from service.core.protocol.step_params import (
 )
 from service.core.records.events import Record
 from service.core.units import metres
-from service.steps.board_poses import BoardPoses
-from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
-from service.steps.inputs import EarlierAnswer, captured_images, earlier_answer
+from service.steps.context import (
+    ROBOT_MOVES,
+    Announcement,
+    EarlierAnswer,
+    JobRequest,
+    JobResult,
+    StepContext,
+    StepKind,
+    StepOutcome,
+)
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
-from service.steps.optics import departing_images, optics_departures
-from service.steps.viewpoints import ViewpointSet, plan_viewpoints
+from service.steps.registration import captured_images
+from service.steps.retakes import departing_images, optics_departures
+from service.steps.viewpoints import BoardPoses, ViewpointSet, plan_viewpoints
 
 if TYPE_CHECKING:
     from service.compute.board.board import Board
@@ -190,7 +198,7 @@ def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Ans
         raise ConfigurationError(
             "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
         )
-    return earlier_answer(context, params.intrinsics_of, calibrate.KIND)
+    return context.earlier_answer(params.intrinsics_of, calibrate.KIND)
 
 
 def _board_capture(
@@ -229,7 +237,7 @@ def _solve(
     camera: EarlierAnswer[calibrate.Answer] | None,
     capture: BoardCapture | None,
 ) -> JobResult:
-    from service.steps.board_looks import board_arguments  # noqa: PLC0415 - as above
+    from service.steps.board_capture import board_arguments  # noqa: PLC0415 - as above
 
     images = captured_images(context, [params.images_of or context.step.id])
     looks = {} if capture is None else {look.capture.artefacts[0].sha256: look for look in capture.looks()}

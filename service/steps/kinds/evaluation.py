@@ -23,8 +23,8 @@ from service.core.protocol.step_params import (
 from service.core.records.events import Record
 from service.core.units import metres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import captured_images, earlier_answer, earlier_result
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures, Share
+from service.steps.registration import captured_images
 from service.steps.registration_jobs import recorded_registration_jobs
 
 _SCAN, _CONTROL, _CT = "scan", "control_scan", "ct"  # fields of the job's arguments
@@ -80,7 +80,7 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Let the worker evaluate every registration that has arrived on the control spheres."""
-    registrations = dict(earlier_result(context, params.registration, register.Registrations).registrations)
+    registrations = dict(context.earlier_result(params.registration, register.Registrations).registrations)
     references: dict[str, Reference | None] = {}
     found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(params.registration))
     arrived = {} if found is None else found.arrived
@@ -90,7 +90,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     measured = {
         name: None
         if step is None or step in context.run.skipped
-        else earlier_answer(context, step, locate_spheres.KIND)
+        else context.earlier_answer(step, locate_spheres.KIND)
         for name, step in scans.items()
     }
     references |= {name: found.reference("") for name, found in measured.items() if found is not None}

@@ -19,11 +19,10 @@ from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAME
 from service.core.records.events import Record
 from service.core.run.state import JobState
 from service.core.units import metres
-from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import EarlierAnswer, artefact_of, earlier_answer
+from service.steps.context import EarlierAnswer, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, Deg, ErrorMm, Measure, MeasureRecord, Share
+from service.steps.registration import decisive
 from service.steps.registration_jobs import recorded_registration_jobs
-from service.steps.registration_sources import decisive
 
 
 class _Posed(Mounting):
@@ -151,11 +150,11 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     skipped = next((step for step in (params.ct, params.scan) if step in context.run.skipped), None)
     if skipped is not None:
         return StepOutcome(Measures(), (), Result(without=skipped))
-    ct = earlier_answer(context, params.ct, locate_spheres.KIND)
-    scan = earlier_answer(context, params.scan, locate_spheres.KIND)
+    ct = context.earlier_answer(params.ct, locate_spheres.KIND)
+    scan = context.earlier_answer(params.scan, locate_spheres.KIND)
     arguments = fuse.Arguments(
-        ct_mesh=artefact_of(context, params.ct, "ct_mesh").sha256,
-        scan_mesh=artefact_of(context, params.scan, "scan_mesh").sha256,
+        ct_mesh=context.earlier_artefact(params.ct, "ct_mesh").sha256,
+        scan_mesh=context.earlier_artefact(params.scan, "scan_mesh").sha256,
         ct=ct.answer,
         scan=scan.answer,
         radius_m=metres(context.protocol.spheres.radius_mm),

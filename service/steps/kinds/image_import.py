@@ -14,7 +14,7 @@ from service.core.records.import_list import ImportedFile, ImportedView, ImportL
 from service.core.records.optics import RecordedOptics
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
-from service.steps.optics import departing_images, optics_departures
+from service.steps.retakes import departing_images, optics_departures
 from service.store.records import NewArtefact
 
 _KINDS = {"calibration": "board_image", "image": "image", "control_image": "control_image"}

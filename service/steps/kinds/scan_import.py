@@ -20,7 +20,6 @@ from service.core.text.words import counted
 from service.core.units import metres
 from service.steps.arrivals import keep_mesh, layout_uncertainties, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import earlier_answer, earlier_result
 from service.steps.kinds import timed_application
 from service.steps.measures import Count, ErrorMm, Measure, SphereMeasures
 
@@ -173,7 +172,7 @@ class _LeftOut:
 
 def _age(context: StepContext, application: str) -> dict[str, float]:
     """Return the time since a coat was applied; nothing, with the reason, if it is unknown. Both clocks are noted."""
-    applied = earlier_result(context, application, timed_application.Result).applied
+    applied = context.earlier_result(application, timed_application.Result).applied
     arrived = context.moment()
     age = elapsed(applied, arrived)
     clocks = {"applied": asdict(applied), "arrived": asdict(arrived)}
@@ -210,7 +209,7 @@ def _arguments(
     )
     if params.compare_with is None or params.compare_with in context.run.skipped:
         return arguments, {}
-    earlier = earlier_answer(context, params.compare_with, locate_spheres.KIND)
+    earlier = context.earlier_answer(params.compare_with, locate_spheres.KIND)
     compared = {
         "reference_m": earlier.answer.spheres_m,
         "reference_covariances_m2": tuple(sphere.covariance_m2 for sphere in earlier.answer.details.spheres),

@@ -11,12 +11,11 @@ from service.compute.planning.motion_plan import Order
 from service.core.protocol.step_params import MovingParams, NeededDevice, RepeatedStep
 from service.core.records.events import Record
 from service.steps.context import ROBOT_MOVES, Announcement, StepContext, StepKind, StepOutcome
-from service.steps.front_end import EarlyFeatures
+from service.steps.due_jobs import EarlyFeatures
 from service.steps.live_numbers import LiveAnalysis, LiveParams
 from service.steps.measures import CaptureMeasures, Count, ErrorMm, PredictedMeasures
-from service.steps.optics import departing_images, optics_departures
-from service.steps.planning import StepPlan, feasible_extra, plan_step
-from service.steps.retakes import advise_retakes, taken_for_good, to_take_again
+from service.steps.motion import StepPlan, feasible_extra, plan_step
+from service.steps.retakes import advise_retakes, departing_images, optics_departures, taken_for_good, to_take_again
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.views import CaptureTask, CaptureTotals, capture_viewpoints
 

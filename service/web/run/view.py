@@ -20,7 +20,7 @@ from service.core.text.words import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.run_record import OpenJob
-from service.steps.images_taken import images_taken
+from service.steps.notes import images_taken
 from service.web.page.run_frame import (
     count,
     drawing_of,

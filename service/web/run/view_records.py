@@ -22,7 +22,7 @@ from service.core.run.state import Deviation, RunState, StepState
 from service.core.text.words import counted, time_here
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
-from service.steps.images_taken import images_taken
+from service.steps.notes import images_taken
 from service.web.page.run_frame import gate_word, limit
 
 if TYPE_CHECKING:

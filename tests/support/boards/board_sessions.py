@@ -21,10 +21,9 @@ from service.core.arms.model import arm_model
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection
 from service.steps.board_plan import Planner, nominal_board, nominal_camera, preview_board
-from service.steps.board_poses import BoardPoses
 from service.steps.context import StationLayout
-from service.steps.planning import usual_posture
-from service.steps.viewpoints import ViewpointSet, flange_target, plan_viewpoints
+from service.steps.motion import usual_posture
+from service.steps.viewpoints import BoardPoses, ViewpointSet, flange_target, plan_viewpoints
 from simulators.scene.arm import ARM_MODEL
 from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 from simulators.ur_controller.kinematics import inverse as joints_for

@@ -11,6 +11,12 @@ CAMERA = {
     "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
 }  # fmt: skip
 
+SPHERES: dict[str, Any] = {
+    "spheres_m": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]],
+    "sphere_covariance_m2": [(1e-10 * np.eye(3)).tolist()] * 4,
+    "radius_m": 0.015,
+}  # as the arguments of a registration's jobs have them
+
 
 def registration_record(poses: str, **more: Any) -> dict[str, Any]:
     """One with the identity for every transform; `more` replaces or adds fields."""
