@@ -173,8 +173,8 @@ class JobRequest:
 
     kind: str
     arguments: Mapping[str, Any]
+    version: int  # of the computation that is asked for
     priority: int = WAITED
-    version: int = 1
 
     @classmethod
     def of(
@@ -202,7 +202,7 @@ class JobRequest:
                 for name in parents:
                     place = place[int(name)] if isinstance(place, list) else place[name]
                 place[field] = reference.record()
-        return cls(kind.name, recorded, priority, kind.version)
+        return cls(kind.name, recorded, kind.version, priority)
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,7 +188,7 @@ def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None
         if name not in evaluated:
             arguments = {**newest.arguments, "registrations": {name: Reference(job.job, "result").record()}}
             key = f"{name}-{name_of(newest)}"
-            request = JobRequest(evaluate.KIND.name, arguments, LATER, 2)
+            request = JobRequest(evaluate.KIND.name, arguments, evaluate.KIND.version, LATER)
             tasks[name] = Task(key, request, newest_job(state, step.id, request.kind, key))
     return tasks
 

@@ -93,7 +93,7 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
     if not begun:
         return None
     newest = max(begun, key=lambda job: job.enqueued_seq)
-    search = JobRequest(newest.kind, newest.arguments, newest.priority)
+    search = JobRequest(newest.kind, newest.arguments, detect_spheres.KIND.version, newest.priority)
     return registration_jobs(state, step, decisive(protocol, step), search, name_of(newest))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.cli.status import status_record
+from service.computations import job_kinds
 from service.core.gates.release import late_s, late_words
 from service.core.geometry import look_at
 from service.core.jobs import Reference
@@ -168,6 +169,24 @@ def test_each_job_is_due_when_its_input_is_there_and_once(tmp_path: Path) -> Non
     assert found is not None
     assert set(found.arrived) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
     assert run.due() == []
+
+
+def test_every_job_is_of_the_version_that_computes_it_also_a_late_evaluation() -> None:
+    run = _Run(protocol())
+    own = JobState(
+        "own", "evaluate", 1, 2, "evaluation/0/evaluate/own/0", {"registrations": {"robot": {}}}, "finished"
+    )
+    run.put("evaluation", own)
+    run.finish("detect_spheres")
+    kinds: set[str] = set()
+    while jobs := run.due():
+        for job in jobs:
+            assert job.version == job_kinds()[job.kind].version, job.kind
+        kinds |= {job.kind for job in jobs}
+        run.enqueue(*jobs)
+        for kind in kinds:
+            run.finish(kind)
+    assert kinds >= {"register", "features", "match", "structure_from_motion", "hybrid", "evaluate"}
 
 
 def test_the_jobs_refer_to_earlier_answers_and_poses_as_reported_are_not_corrected() -> None:
