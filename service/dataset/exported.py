@@ -21,6 +21,7 @@ from service.dataset.export_folder import SUMS, check_folder
 from service.dataset.formats.meshes import png
 from service.dataset.pixels import PixelsOfAnother
 from service.dataset.records import DataSet, Mesh, PosedView
+from service.machine.executors import file_here
 
 INDEX = "data.h5"
 _REMEDY = "Export it again with --format hdf5"
@@ -51,6 +52,10 @@ class StoredPixels:
         """Take the folder of the data set; `mark` is written into pictures where it is not empty."""
         self._folder, self._mark = folder, mark
 
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        """Return the file of the view."""
+        return (self._folder / "views" / f"{view.name}.h5",)
+
     def picture(self, view: PosedView) -> bytes:
         """Return the pixels as PNG: the camera's own file is not in the folder."""
         return png(self.colours(view), self._mark)
@@ -77,7 +82,8 @@ class StoredPixels:
 
     def _array(self, view: PosedView, name: str) -> NDArray[Any]:
         try:
-            with h5py.File(self._folder / "views" / f"{view.name}.h5", "r") as file:
+            (stored,) = self.files(view)
+            with h5py.File(file_here(stored), "r") as file:
                 return np.asarray(file[name])
         except (OSError, KeyError) as error:
             raise DataError(f"{name} cannot be read: {error}", where=view.name, remedy=_REMEDY) from error
@@ -126,6 +132,9 @@ class _Scaled:
 
     def __init__(self, whole: DataSet) -> None:
         self._whole, self._views = whole, {view.name: view for view in whole.views}
+
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        return self._whole.pixels.files(self._views[view.name])
 
     def picture(self, view: PosedView) -> bytes:
         return png(self.colours(view), self._whole.mark)

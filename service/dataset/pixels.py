@@ -19,6 +19,7 @@ from service.compute.pixels.resample import pinhole_of, undistorted, valid_pixel
 from service.compute.pixels.views import FULL_HD, ImageCrop, Splits, marker_free_crops
 from service.core.errors import DataError
 from service.dataset.records import DataSet, Pixels, PosedView
+from service.machine.executors import file_here
 
 _T = TypeVar("_T")
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
@@ -70,10 +71,14 @@ class Photographs:
         self._personal, self._mark = personal, mark
         self._colours = _Last(self._read)
 
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        """Return the photograph."""
+        return (self._files[view.name],)
+
     def picture(self, view: PosedView) -> bytes:
         """Return the file as the camera wrote it, except what was to be removed or marked."""
         try:
-            data = self._files[view.name].read_bytes()
+            data = file_here(self._files[view.name]).read_bytes()
         except OSError as error:
             raise DataError(
                 f"the photograph cannot be read: {error.strerror}", where=view.name, remedy="Verify the evidence"
@@ -87,7 +92,7 @@ class Photographs:
         return self._colours.of(view)
 
     def _read(self, view: PosedView) -> NDArray[np.uint8]:
-        return read_image_of(self._files[view.name], view.camera)
+        return read_image_of(file_here(self._files[view.name]), view.camera)
 
     def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """Return the depth (H, W), z of the mesh."""
@@ -112,6 +117,10 @@ class PixelsOfAnother:
     def __init__(self, inner: Pixels) -> None:
         """Take the other data set's pixels."""
         self._inner = inner
+
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        """Return the files of the other data set."""
+        return self._inner.files(view)
 
     def picture(self, view: PosedView) -> bytes:
         """Return the picture's file."""
@@ -150,6 +159,10 @@ class UndistortedViews(PixelsOfAnother):
         self._sources, self._personal = {view.name: view for view in distorted.views}, personal
         self._colours = _Last(self._resampled)
 
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        """Return the photograph."""
+        return self._inner.files(self._sources[view.name])
+
     def picture(self, view: PosedView) -> bytes:
         """Return the resampled picture, with the photograph's metadata."""
         return _encoded(view, self.colours(view), self._inner.picture(self._sources[view.name]), self._personal)
@@ -175,6 +188,10 @@ class Cropped(PixelsOfAnother):
         super().__init__(whole.pixels)
         self._crops, self._personal = crops, personal
         self._originals = _Last(whole.pixels.picture)
+
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        """Return the files of the source."""
+        return self._inner.files(self._crops[view.name][0])
 
     def picture(self, view: PosedView) -> bytes:
         """Return the picture, cut out and encoded again, with the metadata of the photograph."""

@@ -219,6 +219,10 @@ class ScanFile:
 class Pixels(Interface):
     """The pixel data of a view; read or computed at each call, at the size of `view.camera`."""
 
+    def files(self, view: PosedView) -> tuple[Path, ...]:
+        """Return the files from which the pixels of a view are made, so that these can travel."""
+        ...
+
     def picture(self, view: PosedView) -> bytes:
         """Return the JPEG or PNG file. Raises DataError if it cannot be read."""
         ...

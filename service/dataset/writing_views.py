@@ -34,9 +34,17 @@ _BYTES_A_FACE = 300  # of the mesh, with its tree for rays
 
 @dataclass(frozen=True, slots=True)
 class _ViewTask:
-    """The task of making the files of one view: the file of the data set and the format, and the export's folder."""
+    """The task of making the files of one view.
+
+    Attributes:
+        data_file: the file of the data set and the format.
+        photographs: the files that the data set reads for the view, which find their way with the task.
+        root: the folder of the export.
+        view: the name of the view.
+    """
 
     data_file: Path
+    photographs: tuple[Path, ...]
     root: Path
     view: str
 
@@ -70,7 +78,8 @@ def write_views(
     with tempfile.TemporaryDirectory(prefix="orthocapture-export-") as scratch:
         data_file = Path(scratch) / "data_set"
         data_file.write_bytes(data)
-        tasks = [_ViewTask(data_file, folder.root, name) for name in missing]
+        views = {view.name: view for view in dataset.views}
+        tasks = [_ViewTask(data_file, dataset.pixels.files(views[name]), folder.root, name) for name in missing]
         done = sum(len(names) for name, names in files.items() if name not in missing)
         with mapping(processes, len(tasks)) as map_over:
             for count in map_over(_write_view, tasks):

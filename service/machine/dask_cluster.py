@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from typing import TYPE_CHECKING, Any
 
 from service.core.errors import ComputeError, ConfigurationError
+from service.machine.dask_files import FileSender, compute_asking
 from service.machine.recovering import ConnectionLostError
 from service.machine.remote_task import (
     RemoteResult,
@@ -63,17 +63,22 @@ class DaskConnection:
         try:
             self._require_workers()
         except BaseException:
-            self.close()
+            self._close_client()
             raise
         # Not pure: Dask would otherwise take a file that has changed under its path for the same argument.
         self._executor = self._client.get_executor(pure=False)
+        try:
+            self._files = FileSender(self._client)
+        except self._closed as error:
+            self._close_client()
+            raise ConnectionLostError(f"the connection to {self._address} has ended: {error}") from error
 
-    def submit(self, work: Callable[[RemoteTask], RemoteResult], task: RemoteTask, /) -> Future[RemoteResult]:
+    def submit(self, task: RemoteTask, /) -> Future[RemoteResult]:
         """Send a task. Raises ConnectionLostError if the client is closed."""
         if self._client.status != "running":
             raise ConnectionLostError(f"the connection to {self._address} has ended")
         try:
-            future: Future[RemoteResult] = self._executor.submit(work, task)
+            future: Future[RemoteResult] = self._executor.submit(compute_asking, task, self._files.topic)
         except self._closed as error:
             raise ConnectionLostError(f"the connection to {self._address} has ended: {error}") from error
         return future
@@ -112,7 +117,11 @@ class DaskConnection:
         return error
 
     def close(self) -> None:
-        """Close the client without waiting for long."""
+        """Close the client without waiting for long; workers remove the files that were sent to them."""
+        self._files.close(_CLOSE_S)
+        self._close_client()
+
+    def _close_client(self) -> None:
         try:
             self._client.close(timeout=_CLOSE_S)
         except (OSError, RuntimeError) as error:

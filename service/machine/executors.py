@@ -8,7 +8,7 @@ import os
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -159,9 +159,30 @@ def mapping(processes: int, items: int) -> Generator[MapFunction]:
     """Provide a map over the chosen executor: that of local processes has at most so many, none for one.
 
     The functions and items of a map hold paths and small parameters, no large arrays: they travel to other machines.
+    So do files that these do not see; those that a task reads without having their paths in its item it finds by
+    `file_here`, and its item has them in a field of its own. A folder in an item is one that the task writes into: a
+    machine that does not see it has an empty one.
     """
     with _chosen.get().open(processes, items) as executor:
         yield executor.map
+
+
+_found_at: ContextVar[Mapping[str, Path] | None] = ContextVar("_found_at", default=None)
+
+
+@contextmanager
+def finding_files_at(files: Mapping[str, Path]) -> Generator[None]:
+    """Let `file_here` find files, by their paths on the job's machine, in this block."""
+    before = _found_at.set(files)
+    try:
+        yield
+    finally:
+        _found_at.reset(before)
+
+
+def file_here(path: Path) -> Path:
+    """Return the path at which this machine has a file of the task that it computes: mostly the same."""
+    return (_found_at.get() or {}).get(str(path.absolute()), path)
 
 
 def report_each(

@@ -6,14 +6,14 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Executor, Future, wait
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from service.machine.executors import Place
-from service.machine.remote_task import RemoteResult, RemoteTask, compute_there, remote_task
+from service.machine.remote_task import RemoteResult, RemoteTask, remote_task, write_here
 
 _log = logging.getLogger(__name__)
 _LOOK_S = 1.0  # between looks at the connection
@@ -28,8 +28,8 @@ class ConnectionLostError(Exception):
 class ClusterConnection(Protocol):
     """A connection to the scheduler of other machines."""
 
-    def submit(self, work: Callable[[RemoteTask], RemoteResult], task: RemoteTask, /) -> Future[RemoteResult]:
-        """Send a task. Raises ConnectionLostError if that is known to be in vain."""
+    def submit(self, task: RemoteTask, /) -> Future[RemoteResult]:
+        """Send a task, for `compute_there`. Raises ConnectionLostError if that is known to be in vain."""
         ...
 
     def trouble(self) -> str:
@@ -47,11 +47,14 @@ class ClusterConnection(Protocol):
 
 @dataclass
 class _Open:
-    """A call without an answer: what computes it now."""
+    """A call without an answer: what computes it now.
+
+    `taken`: this machine computes it, or has begun to take the answer of another one.
+    """
 
     call: Callable[[], Any]
     inner: Future[Any] | None = None
-    here: bool = False
+    taken: bool = False
 
 
 class RecoveringExecutor(Executor):
@@ -69,6 +72,8 @@ class RecoveringExecutor(Executor):
         self._lock = threading.Lock()
         self._open: dict[Future[Any], _Open] = {}
         self._local: Executor | None = None
+        # Answers come in the thread that also talks to the scheduler: it must not wait for the disk.
+        self._writing = ThreadPoolExecutor(1, thread_name_prefix="cluster-files")
         self._ended = threading.Event()
         self._watch = threading.Thread(target=self._look, name="cluster-watch", daemon=True)
         self._watch.start()
@@ -86,13 +91,13 @@ class RecoveringExecutor(Executor):
             self._compute_here(outer)
             return outer
         try:
-            inner = self._connection.submit(compute_there, task)
+            inner = self._connection.submit(task)
         except ConnectionLostError as error:
             self._lose(str(error))
             return outer
         with self._lock:
             entry = self._open.get(outer)
-            if entry is not None and not entry.here:
+            if entry is not None and not entry.taken:
                 entry.inner = inner
         inner.add_done_callback(partial(self._take_answer, outer))
         return outer
@@ -109,6 +114,7 @@ class RecoveringExecutor(Executor):
         self._ended.set()
         if wait and self._watch is not threading.current_thread():
             self._watch.join()
+        self._writing.shutdown(wait=wait, cancel_futures=cancel_futures)
         if self._local is not None:
             self._local.shutdown(wait=wait, cancel_futures=cancel_futures)
 
@@ -135,20 +141,31 @@ class RecoveringExecutor(Executor):
             return
         with self._lock:
             entry = self._open.get(outer)
-            if entry is None or entry.here:  # computed here meanwhile
+            if entry is None or entry.taken:  # computed here meanwhile
                 return
-        if error is None:
-            answer = inner.result()
-            self._places[answer.place] += 1
-            _settle(outer, answer.value, None)
-        else:
+            entry.taken = True
+        if error is not None:
             _settle(outer, None, error)
+        elif inner.result().written:
+            self._writing.submit(self._give, outer, inner.result())
+        else:
+            self._give(outer, inner.result())
+
+    def _give(self, outer: Future[Any], answer: RemoteResult) -> None:
+        """Write the files of an answer, and give the value to who asked."""
+        try:
+            write_here(answer.written)
+        except OSError as error:
+            _settle(outer, None, error)
+            return
+        self._places[answer.place] += 1
+        _settle(outer, answer.value, None)
 
     def _lose(self, why: str) -> None:
         """Let everything without an answer be computed here, from now on."""
         with self._lock:
             if self._local is not None:
-                moved = [outer for outer, entry in self._open.items() if not entry.here]
+                moved = [outer for outer, entry in self._open.items() if not entry.taken]
             else:
                 moved = list(self._open)
                 _log.warning(
@@ -163,9 +180,9 @@ class RecoveringExecutor(Executor):
     def _compute_here(self, outer: Future[Any]) -> None:
         with self._lock:
             entry = self._open.get(outer)
-            if entry is None or entry.here or self._local is None:
+            if entry is None or entry.taken or self._local is None:
                 return
-            entry.here = True
+            entry.taken = True
             local = self._local
         try:
             inner = local.submit(entry.call)

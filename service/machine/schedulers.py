@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from service.core.declared_kinds import plug_ins
 from service.core.errors import ConfigurationError
 from service.machine.executors import IN_THIS_PROCESS, InThisProcess, local_pool, noted_places
 from service.machine.recovering import ClusterConnection, ConnectionLostError, RecoveringExecutor
-from service.machine.remote_task import RemoteResult, RemoteTask
+from service.machine.remote_task import RemoteResult, RemoteTask, compute_there
 
 GROUP = "orthocapture.executors"
 _DASK = ("tcp", "tls")
@@ -77,10 +77,10 @@ class PlugInConnection:
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
 
-    def submit(self, work: Callable[[RemoteTask], RemoteResult], task: RemoteTask, /) -> Future[RemoteResult]:
+    def submit(self, task: RemoteTask, /) -> Future[RemoteResult]:
         """Send a task. Raises ConnectionLostError if the executor is broken."""
         try:
-            return self._executor.submit(work, task)
+            return self._executor.submit(compute_there, task)
         except BrokenExecutor as error:
             raise ConnectionLostError(f"the executor is broken: {error}") from error
 

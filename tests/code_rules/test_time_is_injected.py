@@ -43,6 +43,7 @@ SERVICE = {
     "service/cli/operators.py": "the time limit of a socket",
     "service/compute/sfm/colmap_process.py": "the time limit of a child process's answer",
     "service/machine/dask_cluster.py": "how long a scheduler has had no worker",
+    "service/machine/dask_files.py": "how long a file has not come",
     "service/machine/schedulers.py": "rests between tries to reach a scheduler",
     "service/store/objects/anchored.py": "when anchors were compared, of a folder, which has no clock",
     "service/store/database/postgres.py": "a server is waited for, by the host's clock",

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
 import pytest
 
 from service.core.errors import DataError
@@ -15,7 +12,7 @@ from service.machine.executors import mapping
 from service.store.objects.upload import Uploader
 from service.store.store import Store
 from tests.support.processes import cluster_tasks as tasks
-from tests.support.processes.cluster import Cluster, dask_cluster, on
+from tests.support.processes.cluster import dask_cluster, on, stopped
 from tests.support.processes.object_store import Weed
 from tests.support.record.store import capture, start_run
 
@@ -49,14 +46,3 @@ def test_workers_without_the_data_folder_compute_on_its_artefacts(weed: Weed, tm
             with pytest.raises(DataError, match="does not see the file"):
                 list(answers[1])
     assert sorted(file.read_bytes() for file in (elsewhere / "fetched").glob("*/*")) == sorted(contents)
-
-
-@contextmanager
-def stopped(cluster: Cluster) -> Generator[None]:
-    """Stop the workers, which begin nothing meanwhile."""
-    processes = [p for worker in cluster.workers for p in psutil.Process(worker.pid).children(recursive=True)]
-    for process in processes:
-        process.suspend()
-    yield
-    for process in processes:
-        process.resume()

@@ -47,6 +47,8 @@ PLACES = {
     "service/core/run/expected.py": f"{_FIGURE}; {_STAMP}",
     "service/core/text/words.py": _STAMP,
     "service/core/gates/release.py": "by how much a result is late; that it is late follows from the run's state",
+    "service/machine/dask_files.py": _CHANGE,
+    "service/machine/remote_task.py": _CHANGE,
     "service/monitor/alarm.py": _STAMP,
     "service/monitor/figures.py": _FIGURE,
     "service/monitor/reporter.py": "time in which a runner's main loop hangs",

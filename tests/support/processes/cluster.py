@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
@@ -88,8 +88,10 @@ def _address(where: Path) -> str:
 def end_tree(process: subprocess.Popen[bytes]) -> None:
     """Kill a process and those that it started."""
     if process.poll() is None:
-        for child in psutil.Process(process.pid).children(recursive=True):
-            child.kill()
+        with suppress(psutil.NoSuchProcess):  # a worker ends by itself when its scheduler has
+            for child in psutil.Process(process.pid).children(recursive=True):
+                with suppress(psutil.NoSuchProcess):
+                    child.kill()
         process.kill()
     process.wait()
 
@@ -103,6 +105,22 @@ def _start(
             [sys.executable, "-m", *options], cwd=log.parent, env=own,
             stdin=subprocess.DEVNULL, stdout=output, stderr=output,
         )  # fmt: skip
+
+
+@contextmanager
+def stopped(cluster: Cluster) -> Generator[None]:
+    """Stop the workers, which begin nothing meanwhile."""
+    processes: list[psutil.Process] = []
+    for worker in cluster.workers:
+        nanny = psutil.Process(worker.pid)
+        processes += [nanny, *nanny.children(recursive=True)]
+    for process in processes:
+        process.suspend()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.resume()
 
 
 @contextmanager

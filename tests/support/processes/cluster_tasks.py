@@ -7,6 +7,8 @@ import signal
 import time
 from pathlib import Path
 
+from service.core.errors import DataError
+
 
 def square(number: int) -> int:
     """Return the square."""
@@ -40,3 +42,22 @@ def kill_once(task: tuple[int, Path]) -> int:
 def kill_worker(_number: int) -> None:
     """Kill the process that computes this."""
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def copy_end(files: tuple[Path, Path]) -> tuple[Path, str, list[str]]:
+    """Write a file's last bytes to another path; return that path, also as a text, and the names in its folder."""
+    source, target = files
+    target.write_bytes(source.read_bytes()[-1000:])
+    return target, f"written: {target}", sorted(file.name for file in target.parent.iterdir())
+
+
+def extend(file: Path) -> int:
+    """Add to a file, and return its size."""
+    with file.open("ab") as output:
+        output.write(b", more")
+    return file.stat().st_size
+
+
+def refuse(file: Path) -> None:
+    """Read a file, and refuse it. Raises DataError."""
+    raise DataError(f"{file} has {len(file.read_bytes())} bytes", where=str(file))
