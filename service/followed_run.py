@@ -6,10 +6,11 @@ import math
 from dataclasses import dataclass, field
 from threading import Lock
 
-from service.core.protocol.models import Protocol
-from service.core.records.events import Event, RecordedView
+from service.core.protocol import Protocol
+from service.core.records.events import Event
+from service.core.records.run_events import RecordedView
 from service.core.run.decide import advance, fold
-from service.core.run.folded import FoldedRun
+from service.core.run.fold import FoldedRun
 from service.core.run.state import RunState
 from service.store.store import Store
 

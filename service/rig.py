@@ -11,10 +11,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from drivers.interfaces import Abandoned
-from service.core.errors import ConfigurationError, DataError, ProtocolError
-from service.core.records.events import Record
-from service.core.records.import_list import ImportList
-from service.core.text.checked_yaml import (
+from service.core.checked_yaml import (
     NO_LINES,
     FieldPath,
     Plain,
@@ -27,7 +24,10 @@ from service.core.text.checked_yaml import (
     problem_of,
     refuse,
 )
-from service.core.text.files import parse_json
+from service.core.errors import ConfigurationError, DataError, ProtocolError
+from service.core.records.base import Record
+from service.core.records.import_list import ImportList
+from service.core.text_files import parse_json
 from service.core.units import metres
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"

@@ -8,11 +8,12 @@ from typing import Literal, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
-from service.core.gates.release import refuse_release, release_meaning
-from service.core.records.events import Event, ItemTicked, RegionDrawn, RobotSeen, RunReleased
+from service.core.gates import refuse_release, release_meaning
+from service.core.records.entered import reason_of
+from service.core.records.events import Event
+from service.core.records.run_events import ItemTicked, RegionDrawn, RobotSeen, RunReleased
 from service.core.run.actions import needs_leave
 from service.core.run.state import RunState, connected_arms, lost_arms
-from service.core.text.words import reason_of
 from service.dataset.registrations import best_registration
 from service.followed_run import RunRecord
 from service.store.signatures.signing import checkpoint

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from service.computations import term
 from service.computations.memory_grants import waiting_for_memory
 from service.core.errors import IntegrityError
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import RunStarted
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.run_events import RunStarted
 from service.core.run.state import lane_of
-from service.core.text.words import time_here
+from service.core.words import time_here
 from service.followed_run import RunRecord
 from service.steps import params_models
 from service.store.database.engine import RESTORE

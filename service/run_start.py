@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.protocol.models import LoadedProtocol, Protocol
+from service.core.protocol import LoadedProtocol, Protocol
 from service.core.records.entered import RunAbout
-from service.core.records.events import ActionAfterEnd, ActionRefused, OperatorAction, RunStarted
+from service.core.records.events import ActionAfterEnd
+from service.core.records.run_events import ActionRefused, OperatorAction, RunStarted
 from service.core.run.state import RunState
 from service.rig import Rig, RigDevice, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root

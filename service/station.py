@@ -36,10 +36,10 @@ from drivers.interfaces import (
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.recording import RecordedDevice
 from drivers.recording.personal_data import Secrets, named
-from service.core.declared_kinds import plug_ins
+from service.core.checked_yaml import problem_of, refuse
 from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.loading import plug_ins
 from service.core.records.import_list import ImportList
-from service.core.text.checked_yaml import problem_of, refuse
 from service.rig import CollisionSection, FurtherCameraSection, LensSection, OpticsSection, Rig, RigDevice
 from service.steps.context import ConnectionEnd, FurtherCamera, LeaveToMove, StationLayout
 

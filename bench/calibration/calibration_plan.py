@@ -31,9 +31,9 @@ from service.compute.hand_eye.reprojection import board_corners
 from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.planning.motion_plan import best_posture
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from service.core.geometry import Array, Transform, apply, inverse
-from service.core.protocol.models import Motion
+from service.core.protocol import Motion
 from service.rig import CollisionSection, LensSection
 from service.steps.board_plan import START, PlannedBoard, Planner, Why, nominal_board, nominal_camera
 from service.steps.context import StationLayout

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from bench.machine import RESULTS, commit, machine
 from service.compute.arm_correction import corrected_T_base_flange
 from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from service.core.geometry import Array
 from simulators.scene.world import ARMS, Scene
 from tests.support.boards.board_sessions import (

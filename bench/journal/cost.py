@@ -21,7 +21,7 @@ from typing import Any
 from unittest.mock import patch
 
 from bench.machine import RESULTS, commit, machine
-from service.core.records.events import OperatorAction
+from service.core.records.run_events import OperatorAction
 from service.store.database.engine import SqliteDatabase
 from service.store.durable_effects import DurableFiles
 from service.store.store import Store

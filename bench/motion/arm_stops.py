@@ -27,9 +27,8 @@ from bench.machine import RESULTS, commit, machine
 from drivers.interfaces import Abandoned
 from drivers.kuka import KukaConfig
 from drivers.ur import UrConfig
-from service.core.arms.model import ArmModel, known_arms
-from service.core.arms.motion_limits import motion_problems
-from service.core.protocol.models import Motion
+from service.core.arms import ArmModel, known_arms
+from service.core.protocol import Motion, motion_problems
 from simulators.kuka_controller.kinematics import MODELS as LBRS
 from simulators.ur_controller.kinematics import MODELS as URS
 from tests.support.arms.arm_watch import watched_arm

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from service.core.arms.model import arm_model, flange_pose, pose_gap
-from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
+from service.core.arms import arm_model, flange_pose, pose_gap
+from service.core.records.run_events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.core.units import deg, mm

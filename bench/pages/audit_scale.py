@@ -19,7 +19,7 @@ from unittest import mock
 from urllib.parse import quote
 
 from bench.machine import RESULTS, commit, machine
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import Browser, web_site

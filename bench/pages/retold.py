@@ -7,16 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from service.core.jobs import Each, Reference, read_reference
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import (
-    Event,
-    JobEnqueued,
-    JobFinished,
-    OperatorAction,
-    Payload,
-    RunStarted,
-    SessionStarted,
-)
+from service.core.protocol import parse_protocol
+from service.core.records.events import Event, Payload
+from service.core.records.run_events import JobEnqueued, JobFinished, OperatorAction, RunStarted, SessionStarted
 from service.rig import Rig
 from service.run_start import start_run
 from service.steps import params_models

@@ -20,8 +20,8 @@ from PIL import Image
 
 from bench.machine import REPOSITORY
 from bench.pages.retold import retell
-from service.core.gates.verdict import evaluate_gates
-from service.core.records.events import ItemTicked, OperatorAction, RecordCorrected, ViewpointCaptured
+from service.core.gates import evaluate_gates
+from service.core.records.run_events import ItemTicked, OperatorAction, RecordCorrected, ViewpointCaptured
 from service.people.person import Role
 from service.people.sessions import People
 from service.rig import Rig, load_rig

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.machine import RESULTS, commit, machine
-from service.core.records.events import DeviceTrouble
+from service.core.records.run_events import DeviceTrouble
 from service.store.durable_effects import SystemClock
 from service.store.signatures.log import NAME
 from service.store.signatures.second_place import Away, LogCopy, SecondPlace

@@ -101,7 +101,8 @@ def measure(folder: Path, repeat: int) -> dict[str, float]:
 
     The processor's time, because other programs on the machine make no difference to it.
     """
-    from service.core.records.events import SignInRecorded, StepNote  # noqa: PLC0415 - of another checkout
+    from service.core.records.events import SignInRecorded  # noqa: PLC0415 - of another checkout
+    from service.core.records.run_events import StepNote  # noqa: PLC0415
     from service.store.records import SITE  # noqa: PLC0415
     from service.store.signatures.signing import checkpoint  # noqa: PLC0415
     from tests.support.pages.web import web_site  # noqa: PLC0415
@@ -152,7 +153,7 @@ def measure(folder: Path, repeat: int) -> dict[str, float]:
 
 def run_item(protocol: str) -> str:
     """The first item of a protocol's first checklist."""
-    from service.core.protocol.models import parse_protocol  # noqa: PLC0415 - of another checkout
+    from service.core.protocol import parse_protocol  # noqa: PLC0415 - of another checkout
     from service.steps import params_models  # noqa: PLC0415
 
     loaded = parse_protocol(protocol.encode(), params_models(), name="bench.yaml")

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from bench.machine import REPOSITORY
 from service.cli.demo import free_address
 from service.cli.run import sigterm_like_ctrl_c
-from service.core.records.events import JobFinished, ViewpointCaptured
+from service.core.records.run_events import JobFinished, ViewpointCaptured
 from service.core.units import megabytes
 from service.dataset.export_folder import check_folder
 

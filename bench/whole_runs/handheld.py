@@ -16,7 +16,7 @@ from typing import Any
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.demo_accuracy import MEASURES, run_demo
 from service.cli.demo import true_errors_mm
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store

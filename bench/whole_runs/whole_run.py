@@ -18,7 +18,7 @@ import psutil
 
 from bench.machine import REPOSITORY
 from service.cli.demo import true_errors_mm
-from service.core.records.events import RunReleased
+from service.core.records.run_events import RunReleased
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
 from service.store.signatures.signing import checkpoint

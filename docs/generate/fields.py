@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from service.core.protocol.step_params import NamesStep
+from service.core.step_params import NamesStep
 
 # The end of a name → the unit of its number; the longest that fits counts.
 UNITS: Mapping[str, str] = {

@@ -7,7 +7,7 @@ from typing import Any
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
 from drivers.plugin import DriverSpec
-from service.core.protocol.models import ProtocolFields, StepFields
+from service.core.protocol import ProtocolFields, StepFields
 from service.rig import RigSection
 
 _MADE = "Made from the code by `make reference`."

@@ -12,7 +12,7 @@ from docs.generate.jobs import jobs_text
 from docs.generate.roles import roles_text
 from docs.generate.steps import steps_text
 from service.core.documents import lifecycle_text, schema_text, ways_text
-from service.core.protocol.models import Protocol, load_protocol
+from service.core.protocol import Protocol, load_protocol
 from service.steps import params_models
 
 REFERENCE = Path(__file__).parents[1] / "reference"

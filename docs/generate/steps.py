@@ -10,8 +10,8 @@ from pydantic import BaseModel
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
 from service.computations import job_kinds
-from service.core.gates.measure_names import REGISTRATION_MEASURE_NAMES, measure_name
-from service.core.protocol.models import Protocol, Step
+from service.core.measure_names import REGISTRATION_MEASURE_NAMES, measure_name
+from service.core.protocol import Protocol, Step
 from service.steps import step_kinds
 from service.steps.context import StepKind
 from service.steps.measures import Measure, RegistrationMeasures

@@ -41,9 +41,9 @@ from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
 from drivers.kuka.speeds import Speeds
 from drivers.kuka.wire import JOINTS, Hello, State, agree, flange_words, to_abc
-from service.core.arms.model import ArmModel, flange_pose, known_arms
-from service.core.arms.seven_axes import nearest_posture
+from service.core.arms import ArmModel, flange_pose, known_arms
 from service.core.geometry import to_rotation_vector
+from service.core.seven_axes import nearest_posture
 from service.core.units import mm
 
 DRIVER_VERSION = "1"

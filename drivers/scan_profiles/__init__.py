@@ -8,7 +8,7 @@ from typing import Literal
 
 from drivers.meshes.mesh_file import MESH_SUFFIXES
 from drivers.scan_profiles.profile import ScanProfile
-from service.core.declared_kinds import plug_ins
+from service.core.loading import plug_ins
 
 GROUP = "orthocapture.scan_profiles"
 _MESHES: Mapping[str, Literal["mm"]] = dict.fromkeys(MESH_SUFFIXES, "mm")

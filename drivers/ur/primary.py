@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import Array
-from service.core.arms.model import ArmModel, flange_pose
+from service.core.arms import ArmModel, flange_pose
 from service.core.units import mm
 
 PORT = 30001

@@ -53,7 +53,7 @@ from drivers.ur.samples import (
 from drivers.ur.script import ControlScript
 from drivers.ur.tool import SET_ELSEWHERE, read_back
 from drivers.ur.watchdog import Watchdog
-from service.core.arms.model import known_arm
+from service.core.arms import known_arm
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
 
 DRIVER_VERSION = "1"

@@ -19,7 +19,7 @@ from drivers.errors import DeviceFaultError, DeviceTimeoutError
 from drivers.interfaces import Array, Payload, Transform
 from drivers.ur.link import vendor
 from drivers.ur.script import wait
-from service.core.arms.model import ArmModel, fits, flange_pose, pose_gap
+from service.core.arms import ArmModel, fits, flange_pose, pose_gap
 from service.core.geometry import inverse
 from service.core.units import deg, mm
 

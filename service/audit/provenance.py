@@ -15,7 +15,7 @@ from service.audit.record.rows import EventRow, head, plain, plain_payload, read
 from service.audit.record.search import artefacts_of_events, one_artefact
 from service.computations import job_kinds
 from service.core.jobs import Each, Reference, references_in
-from service.core.records.events import FilesKept, JobEnqueued
+from service.core.records.run_events import FilesKept, JobEnqueued
 from service.store.event_index import cut_words, matching
 from service.store.events import parse_canonical
 from service.store.records import Artefact

@@ -17,9 +17,9 @@ import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from service.benchmark.versions import commit_in, first_line, of_packages
-from service.core.declared_kinds import declared_kinds, kind_named
 from service.core.errors import DataError
 from service.core.geometry import Array
+from service.core.loading import declared_kinds, kind_named
 
 GROUP = "orthocapture.reconstruction_methods"
 Command = tuple[str, ...]

@@ -21,14 +21,14 @@ from service.computations.benchmark import (
 )
 from service.compute.pixels.views import SPARSE_VIEWS
 from service.core.errors import DataError, IntegrityError
-from service.core.gates.release import refuse_data_set, refuse_export
+from service.core.gates import refuse_data_set, refuse_export
 from service.core.jobs import arguments_name, key_stem
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import Event, JobFinished, RunStarted
-from service.core.run.fold import fold
-from service.core.run.folded import FoldedRun
+from service.core.protocol import parse_protocol
+from service.core.records.events import Event
+from service.core.records.run_events import JobFinished, RunStarted
+from service.core.run.fold import FoldedRun, fold
 from service.core.run.state import LATER
-from service.core.text.words import SIMULATED
+from service.core.words import SIMULATED
 from service.dataset.exported import lossless_data_set
 from service.dataset.records import DataSet
 from service.dataset.registrations import own_registration, registrations

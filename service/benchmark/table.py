@@ -21,7 +21,7 @@ from service.compute.ground_truth.distances import PointIndex
 from service.compute.ground_truth.heat_map import HeatScale, Panel, heat_bar, heat_row
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
-from service.core.text.words import SIMULATED
+from service.core.words import SIMULATED
 from service.dataset.formats.meshes import png
 
 _NONE = "–"

@@ -14,12 +14,12 @@ from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, RunOption, 
 from service.cli.options import OperatorOption, PasswordOption, acting_person, typed_password
 from service.computations import term
 from service.core.errors import ConfigurationError, IllegalTransitionError
-from service.core.protocol.models import Protocol
-from service.core.records.events import CaptureAsked, OperatorAction
+from service.core.protocol import Protocol
+from service.core.records.entered import reason_of
+from service.core.records.run_events import CaptureAsked, OperatorAction
 from service.core.run.actions import VERBS, capture_refusal, record_to_sign, refuse
 from service.core.run.fold import fold
 from service.core.run.state import RunState, connected_arms, lost_arms
-from service.core.text.words import reason_of
 from service.followed_run import RunRecord, read_log
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts, who_pauses

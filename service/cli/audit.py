@@ -35,10 +35,10 @@ from service.cli.exit_status import ExitStatus
 from service.cli.options import OperatorOption, PasswordOption, acting_person
 from service.cli.terminal_output import listed, styled
 from service.core.errors import IntegrityError
-from service.core.gates.release import release_meaning
-from service.core.text.person_names import cleaned_name
-from service.core.text.words import counted
+from service.core.gates import release_meaning
+from service.core.records.entered import cleaned_name
 from service.core.units import megabytes
+from service.core.words import counted
 from service.followed_run import read_log
 from service.people.authorisation import Identity
 from service.run_acts import release_run, require_releasable

@@ -27,7 +27,7 @@ from service.cli.common import (
 from service.cli.exit_status import ExitStatus
 from service.cli.options import OperatorOption, PasswordOption, acting_name
 from service.core.errors import ConfigurationError
-from service.core.text.words import counted
+from service.core.words import counted
 from service.store.database.engine import database_path
 from service.store.runs import resolve_run
 from service.store.store import Store

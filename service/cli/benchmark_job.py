@@ -12,8 +12,8 @@ from service.cli.common import console, error_console
 from service.cli.stop_request import stop_requested
 from service.computations.benchmark import KIND, BenchmarkResult
 from service.core.errors import ComputeError, IntegrityError
-from service.core.records.events import JobFailed, JobFinished
-from service.core.text.words import counted, time_here
+from service.core.records.run_events import JobFailed, JobFinished
+from service.core.words import counted, time_here
 from service.dataset.summary import summarise
 from service.monitor.snapshot import living_workers
 from service.run_start import recorded_run

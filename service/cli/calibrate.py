@@ -59,12 +59,12 @@ from service.compute.poses.robot_files import (
     read_joints_csv,
     read_robot_poses,
 )
-from service.core.arms.model import ArmModel, arm_model
+from service.core.arms import ArmModel, arm_model
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
-from service.core.text.files import file_text, parse_json
-from service.core.text.words import counted
+from service.core.text_files import file_text, parse_json
 from service.core.units import LengthUnit, mm
+from service.core.words import counted
 
 _BESIDE = {"T_flange_camera": "T_base_camera", "T_base_board": "T_flange_board"}
 

@@ -24,7 +24,7 @@ from typer.models import OptionInfo
 from service.cli.exit_status import ExitStatus, exit_status
 from service.cli.terminal_output import Terminal, bar_of_shares
 from service.core.errors import ConfigurationError, OrthocaptureError, ProtocolError
-from service.core.shown_text import shown, shown_json, shown_lines
+from service.core.words import shown, shown_json, shown_lines
 from service.store.data_folder import data_folder
 
 PROGRESS_AFTER_S = 2.0

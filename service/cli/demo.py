@@ -42,7 +42,7 @@ from service.computations.evaluate import Row
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, inverse
-from service.core.protocol.models import LoadedProtocol, load_protocol
+from service.core.protocol import LoadedProtocol, load_protocol
 from service.core.units import mm
 from service.dataset.export_folder import check_folder
 from service.dataset.registrations import shared_adjustment_note

@@ -30,11 +30,11 @@ from service.cli.common import (
 )
 from service.cli.exit_status import ExitStatus
 from service.cli.run import RigOption
-from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.protocol.models import Protocol, load_protocol
-from service.core.records.events import HostClock
+from service.core.protocol import Protocol, load_protocol
+from service.core.recorded_devices import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
+from service.core.records.run_events import HostClock
 from service.core.units import gigabytes
 from service.monitor.host import host_clock
 from service.rig import Rig, load_rig

@@ -32,7 +32,7 @@ from service.cli.scheduler import (
 )
 from service.core.errors import ConfigurationError
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
-from service.core.text.words import counted
+from service.core.words import counted
 from service.machine.executors import computing_at
 from service.store.store import Store
 

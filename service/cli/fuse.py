@@ -25,9 +25,9 @@ from service.computations.fuse.compute import MEANINGS, STAGES, FusedMeshes, Mes
 from service.compute.ground_truth.align import align
 from service.compute.ground_truth.fuse import Source
 from service.compute.ground_truth.surface import Surface
-from service.core.gates.verdict import judge
-from service.core.protocol.models import Gate
-from service.core.records.events import GateVerdict
+from service.core.gates import judge
+from service.core.protocol import Gate
+from service.core.records.run_events import GateVerdict
 from service.core.units import metres
 
 TRANSPORT_GATE = Gate(

@@ -39,7 +39,7 @@ from service.cli.options import (
 from service.cli.run import WorkerOption, drive
 from service.computations.evaluate import Row
 from service.core.errors import ConfigurationError
-from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
+from service.core.protocol import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
 from service.core.records.import_list import FileRole, ImportList, PhotographRole
 from service.core.units import megabytes

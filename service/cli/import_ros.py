@@ -36,8 +36,8 @@ from service.compute.poses.ros_recording import (
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Transform
 from service.core.picture_files import kind_of
-from service.core.text.words import counted
 from service.core.units import ms, nanoseconds, seconds_of_ms, seconds_of_ns
+from service.core.words import counted
 
 _SUFFIXES = {"JPEG": ".jpg", "PNG": ".png"}
 _HAND_EYE_NOTE = "from the static transforms of the recording; no uncertainty is stated there"

@@ -34,8 +34,8 @@ from service.compute.intrinsics.optics import Optics, compare_optics, states_foc
 from service.compute.intrinsics.plots import calibration_plots
 from service.compute.intrinsics.uncertainty import ProjectionUncertainty
 from service.core.errors import ComputeError, ConfigurationError, DataError
-from service.core.text.words import counted
 from service.core.units import metres, mm
+from service.core.words import counted
 
 _SQUARE_MM = (0.5, 1000.0)  # plausible squares; anything else is probably in another unit
 

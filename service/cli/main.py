@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from service.cli.exit_status import ExitStatus
 from service.core.loading import begin_loading, end_loading
-from service.core.shown_text import shown, shown_lines
+from service.core.words import shown, shown_lines
 from service.logs.terminal import show_own_words_only
 
 

@@ -13,8 +13,8 @@ import typer
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.exit_status import ExitStatus
 from service.core.errors import ConfigurationError
-from service.core.text.words import counted
 from service.core.units import gigabytes
+from service.core.words import counted
 from service.logs.file_log import file_log
 from service.machine.resources import compute_in_background
 from service.store.access import kept_to

@@ -15,17 +15,16 @@ from typing import TYPE_CHECKING, Any
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
 from service.computations import term
 from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError
-from service.core.gates.acceptance import demanded_role
-from service.core.protocol.models import Protocol, Step, irreversible_warning
-from service.core.records.events import OperatorAction
+from service.core.gates import demanded_role
+from service.core.protocol import Protocol, Step, irreversible_warning
+from service.core.records.entered import reason_of
 from service.core.records.import_list import FileRole, ImportList, PhotographRole
+from service.core.records.run_events import OperatorAction
 from service.core.recovery import takes_words
 from service.core.run.decide import AskOperator
-from service.core.run.noted import HandWork
-from service.core.run.state import RunState
-from service.core.shown_text import shown
-from service.core.text.files import parse_json
-from service.core.text.words import reason_of
+from service.core.run.state import HandWork, RunState
+from service.core.text_files import parse_json
+from service.core.words import shown
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for

@@ -12,7 +12,7 @@ import typer
 
 from service.core.errors import ConfigurationError
 from service.core.records.entered import RunAbout, about_run, require_specimen
-from service.core.shown_text import shown
+from service.core.words import shown
 from service.people.authorisation import Identity, who_acts
 from service.people.person import Permission
 from service.people.sessions import People

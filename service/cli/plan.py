@@ -23,7 +23,7 @@ from service.cli.common import (
 )
 from service.cli.status import next_best_views
 from service.core.errors import ConfigurationError
-from service.core.protocol.models import Step, load_protocol
+from service.core.protocol import Step, load_protocol
 from service.core.run.fold import fold
 from service.rig import load_rig
 from service.run_start import recorded_run

@@ -17,8 +17,8 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.core.documents import lifecycle_text, schema_text, ways_text
-from service.core.protocol.models import load_protocol
-from service.core.text.words import counted
+from service.core.protocol import load_protocol
+from service.core.words import counted
 from service.rig import load_rig
 from service.station import devices_of
 from service.steps import params_models

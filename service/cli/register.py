@@ -50,10 +50,10 @@ from service.compute.poses.camera_files import read_camera_json, read_spheres_js
 from service.compute.poses.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
-from service.core.gates.verdict import describe_judged, judge
+from service.core.gates import describe_judged, judge
 from service.core.geometry import Array
-from service.core.protocol.models import Gate
-from service.core.records.events import GateVerdict
+from service.core.protocol import Gate
+from service.core.records.run_events import GateVerdict
 from service.core.units import metres, mm
 from service.machine.executors import computing_at
 

@@ -31,7 +31,7 @@ from service.cli.exit_status import ExitStatus
 from service.cli.terminal_output import styled
 from service.computations import term
 from service.core.errors import OrthocaptureError
-from service.core.gates.verdict import describe
+from service.core.gates import describe
 from service.core.units import megabytes
 from service.worker.loop import HANDLERS
 

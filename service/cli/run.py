@@ -51,7 +51,7 @@ from service.cli.options import (
 from service.cli.status import status_record
 from service.cli.stop_request import stop_requested
 from service.core.errors import ConfigurationError, PersonNeededError
-from service.core.protocol.models import Protocol, load_protocol
+from service.core.protocol import Protocol, load_protocol
 from service.core.records.entered import about_run
 from service.core.run.fold import fold
 from service.core.run.state import RunState

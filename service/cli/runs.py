@@ -27,8 +27,8 @@ from service.cli.common import (
     require_writable,
     write_whole,
 )
-from service.core.gates.measure_names import measure_name
-from service.core.text.words import counted
+from service.core.measure_names import measure_name
+from service.core.words import counted
 from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.store import Store

@@ -31,8 +31,8 @@ from service.cli.common import (
     shipped_protocols,
 )
 from service.core.errors import ConfigurationError, StoreError
-from service.core.text.person_names import cleaned_name
-from service.core.text.words import local_time
+from service.core.records.entered import cleaned_name
+from service.core.words import local_time
 from service.logs.file_log import file_log
 from service.people.sessions import People
 from service.rig import load_rig

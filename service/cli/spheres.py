@@ -34,8 +34,8 @@ from service.compute.surfaces.mesh_spheres import (
 )
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
-from service.core.text.words import counted
 from service.core.units import metres, mm
+from service.core.words import counted
 
 _NAMED = 3  # most spheres listed in an error
 

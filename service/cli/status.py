@@ -19,13 +19,13 @@ from service.cli.common import (
 )
 from service.cli.terminal_output import listed
 from service.computations import live_summary, live_view
-from service.core.gates.verdict import Standing, describe, standing
+from service.core.gates import Standing, describe, standing
 from service.core.records.entered import about_rows
-from service.core.records.events import GateVerdict
+from service.core.records.run_events import GateVerdict
 from service.core.recovery import takes_words, ways_on
 from service.core.run.expected import tries_words
 from service.core.run.state import RunState, StepState, lost_arms
-from service.core.text.words import time_utc
+from service.core.words import time_utc
 from service.followed_run import read_log
 from service.run_record import open_jobs, results_to_come
 from service.run_start import recorded_run

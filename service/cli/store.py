@@ -22,8 +22,8 @@ from service.cli.common import (
 from service.cli.exit_status import ExitStatus
 from service.cli.object_store import gc_spool, upload_command
 from service.cli.options import OperatorOption, PasswordOption, acting_name, acting_person
-from service.core.text.words import counted
 from service.core.units import gigabytes
+from service.core.words import counted
 from service.store.backup.backup import BackupOptions, BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore
 from service.store.copying import copy_record

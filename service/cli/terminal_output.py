@@ -12,7 +12,7 @@ from rich.console import Console, RenderableType
 from rich.panel import Panel
 from rich.text import Text
 
-from service.core.shown_text import shown_continued, shown_lines
+from service.core.words import shown_continued, shown_lines
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn

@@ -28,7 +28,7 @@ from service.cli.scheduler import (
 )
 from service.computations import job_kinds
 from service.core.errors import ConfigurationError
-from service.core.text.words import counted
+from service.core.words import counted
 from service.logs.file_log import file_log
 from service.store.access import kept_to
 from service.worker.pool import work_side_by_side

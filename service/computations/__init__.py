@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 from service.computations.kind import JobKind
-from service.core.declared_kinds import KindsOnDemand
+from service.core.loading import KindsOnDemand
 
 GROUP = "orthocapture.jobs"  # entry points of plug-ins; each names a JobKind
 

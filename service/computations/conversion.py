@@ -32,7 +32,7 @@ from service.compute.pixels.resample import camera_at
 from service.compute.surfaces.mesh_spheres import MeshSphere
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
-from service.core.records.events import Uncertainty
+from service.core.records.run_events import Uncertainty
 from service.core.units import deg, metres, mm
 
 

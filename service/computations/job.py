@@ -13,7 +13,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from service.computations.kind import Demand, JobKind, JobRecord, NoAnswer
 from service.core.errors import IntegrityError
-from service.core.records.events import ArtefactRef, Event
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Event
 
 A = TypeVar("A")
 

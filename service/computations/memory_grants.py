@@ -21,7 +21,7 @@ import psutil
 from pydantic import ValidationError
 
 from service.core.errors import ComputeError
-from service.core.records.events import Record
+from service.core.records.base import Record
 from service.core.units import megabytes
 from service.machine.resources import MachineMemory, machine_memory
 from service.store.durable_effects import Clock

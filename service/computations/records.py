@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pydantic import Field
 
 from service.computations.kind import JobRecord
-from service.core.records.events import Uncertainty
+from service.core.records.run_events import Uncertainty
 from service.core.run.state import JobState
 
 Matrix = tuple[tuple[float, ...], ...]  # row by row

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.arm_kinematics import chain, dh_jacobian, parallel_jacobian, pose_gap
-from service.core.arms.model import ArmModel, arm_model
+from service.core.arms import ArmModel, arm_model
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.units import mm

@@ -9,8 +9,8 @@ from itertools import product
 import numpy as np
 
 from service.compute.descent import Damping, largest, levenberg_marquardt
-from service.core.arms import seven_axes
-from service.core.arms.model import ArmModel, known_arms
+from service.core import seven_axes
+from service.core.arms import ArmModel, known_arms
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, to_rotation_vector
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.core.text.files import file_text, parse_json
+from service.core.text_files import file_text, parse_json
 
 _OPTIONAL = ("k3", "k4", "k5", "k6")
 

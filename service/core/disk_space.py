@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from service.core.protocol.models import Protocol
+from service.core.protocol import Protocol
 from service.core.recovery import planned_views
 from service.core.run.state import RunState
 from service.core.units import gigabytes, megabytes

@@ -7,11 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
 
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import limits
-from service.core.protocol.models import Gate, Protocol, Step, protocol_json_schema
-from service.core.protocol.step_params import StepParams
-from service.core.records.events import GateVerdict
+from service.core.gates import limits
+from service.core.measure_names import measure_name
+from service.core.protocol import Gate, Protocol, Step, protocol_json_schema
+from service.core.records.run_events import GateVerdict
 from service.core.recovery import REMEDIES, WayOn, planned_views, recovery_policy, takes_words, ways_on
 from service.core.run.fold import initial_state
 from service.core.run.lifecycle import (
@@ -24,8 +23,8 @@ from service.core.run.lifecycle import (
     state_name,
     transition_table,
 )
-from service.core.run.state import Failure, RunState, StepState
-from service.core.run.state_transitions import change
+from service.core.run.state import Failure, RunState, StepState, change
+from service.core.step_params import StepParams
 
 
 def schema_text(params_models: Mapping[str, type[StepParams]]) -> str:

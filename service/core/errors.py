@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.core.shown_text import shown_lines
+from service.core.words import shown_lines
 
 _LONGEST, _LONGEST_LINE = 20_000, 4_000  # characters: a quoted file may hold a megabyte without a space
 

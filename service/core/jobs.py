@@ -16,7 +16,7 @@ from types import NoneType
 from typing import Any, cast
 
 from service.core.errors import IntegrityError
-from service.core.records.events import ComputedBy
+from service.core.records.run_events import ComputedBy
 from service.core.run.state import JobState, RunState, StepState
 
 

@@ -8,13 +8,12 @@ from itertools import groupby
 from statistics import median
 from typing import Any, Literal
 
-from service.core.gates.acceptance import acceptance_refusal, demanded_role, dependent_steps, used_steps
-from service.core.protocol.models import Protocol, Recovery, Step
+from service.core.gates import acceptance_refusal, demanded_role, dependent_steps, used_steps
+from service.core.protocol import Protocol, Recovery, Step
 from service.core.records.base import seconds_between
-from service.core.records.events import OperatorVerb
+from service.core.records.run_events import OperatorVerb
 from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
-from service.core.run.noted import Mending
-from service.core.run.state import RunState, StepState
+from service.core.run.state import Mending, RunState, StepState
 
 # `abort`: a person is asked, and to end the run is what is recommended. Only a person ends a run.
 Policy = Literal["retry", "ask", "abort"]

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.core.gates.acceptance import accepted_gates
-from service.core.gates.verdict import BOUNDS_HOLD, describe, standing
+from service.core.gates import BOUNDS_HOLD, accepted_gates, describe, standing
 from service.core.recorded_devices import bodies, recorded_report
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
-from service.core.records.events import DeviceOpened
 from service.core.records.import_list import imported_sentence
+from service.core.records.run_events import DeviceOpened
 from service.core.units import mm
 from service.dataset.records import About, UsedDevice
 from service.dataset.registrations import late_results, shared_adjustment_note

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
 from service.core.errors import DataError
-from service.core.text.files import parse_json
+from service.core.text_files import parse_json
 from service.dataset.export_folder import SUMS, check_folder
 from service.dataset.formats.meshes import png
 from service.dataset.pixels import PixelsOfAnother

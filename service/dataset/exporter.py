@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.core.declared_kinds import declared_kinds, kind_named
+from service.core.loading import declared_kinds, kind_named
 from service.dataset import card, croissant
 from service.dataset.crate import METADATA, crate
 from service.dataset.croissant import VIEWS_NAME, views_csv

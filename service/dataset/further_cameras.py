@@ -10,11 +10,11 @@ import numpy as np
 
 from service.computations.further_camera import Answer
 from service.computations.records import Matrix
-from service.core.clocks import ClockOffset, clock_offset
 from service.core.geometry import Transform
-from service.core.protocol.models import Protocol
-from service.core.records.events import ArtefactRef, FurtherExposure, RecordedView, ViewpointCaptured
-from service.core.records.optics import RecordedOptics
+from service.core.protocol import Protocol
+from service.core.recorded_devices import ClockOffset, clock_offset
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import FurtherExposure, RecordedOptics, RecordedView, ViewpointCaptured
 from service.core.run.state import RunState
 from service.core.units import mm, mrad
 from service.dataset.registrations import further_cameras

@@ -13,9 +13,9 @@ from service.computations.further_camera import Answer
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
 from service.compute.registration.pose_errors import product_jacobians
-from service.core.clocks import clock_offset
 from service.core.geometry import Array, Transform
-from service.core.records.events import ViewpointCaptured
+from service.core.recorded_devices import clock_offset
+from service.core.records.run_events import ViewpointCaptured
 from service.core.units import mm, mrad
 from service.dataset.further_cameras import pose_sigmas
 from service.dataset.registrations import further_cameras

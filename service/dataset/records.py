@@ -18,7 +18,7 @@ from service.compute.pixels.views import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement, Party, doi_address, licence_address, party
-from service.core.text.words import SIMULATED
+from service.core.words import SIMULATED
 
 NOT_STATED = "not stated"
 

@@ -19,10 +19,10 @@ from service.computations.evaluate import ErrorBudget, Row, best_row
 from service.computations.kind import JobRecord
 from service.computations.register import Registration, Registrations
 from service.core.errors import IntegrityError
-from service.core.gates.release import late_words
-from service.core.protocol.models import Protocol
-from service.core.protocol.step_params import Gives
+from service.core.gates import late_words
+from service.core.protocol import Protocol
 from service.core.run.state import JobState, RunState, lane_of
+from service.core.step_params import Gives
 
 _R = TypeVar("_R", bound=JobRecord)
 

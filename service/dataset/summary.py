@@ -18,10 +18,10 @@ from service.computations.register import Registration
 from service.compute.ground_truth.surface import read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply
-from service.core.protocol.models import Protocol
-from service.core.records.events import ArtefactRef, JobFinished, RecordedView
-from service.core.run.fold import fold
-from service.core.run.folded import FoldedRun
+from service.core.protocol import Protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import JobFinished, RecordedView
+from service.core.run.fold import FoldedRun, fold
 from service.core.run.state import JobState, RunState
 from service.core.units import metres
 from service.dataset.records import Mesh

@@ -11,7 +11,7 @@ import logging
 import os
 import platform
 
-from service.core.shown_text import shown_continued
+from service.core.words import shown_continued
 
 ASKED = "ORTHOCAPTURE_LIBRARY_WORDS"
 _OURS = frozenset({"service", "drivers", "simulators", "orthocapture", "root"})

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from service.core.declared_kinds import plug_ins
 from service.core.errors import ConfigurationError
+from service.core.loading import plug_ins
 from service.machine.executors import IN_THIS_PROCESS, InThisProcess, local_pool, noted_places
 from service.machine.recovering import ClusterConnection, ConnectionLostError, RecoveringExecutor
 from service.machine.remote_task import RemoteResult, RemoteTask, compute_there

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, case, func, select, text
 
 from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import OrthocaptureError
-from service.core.records.events import RunStarted
+from service.core.records.run_events import RunStarted
 from service.core.run.expected import EarlierTimes
 from service.core.run.state import EARLY
 from service.core.units import gigabytes

@@ -12,7 +12,7 @@ import threading
 import time
 
 from drivers.machine_pressure import processor_time
-from service.core.records.events import HostClock
+from service.core.records.run_events import HostClock
 from service.core.units import seconds_of_us
 
 _SYSTEM_TIME = re.compile(r"^System time\s*:\s*([0-9.]+) seconds (fast|slow) of NTP time", re.MULTILINE)

@@ -14,8 +14,7 @@ from typing import Any, Literal
 import psutil
 from pydantic import ValidationError
 
-from service.core.records.base import age_s
-from service.core.records.events import Record
+from service.core.records.base import Record, age_s
 from service.store.durable_effects import Clock
 
 STALE_S = 5.0

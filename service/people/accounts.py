@@ -8,8 +8,8 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
+from service.core.records.entered import reason_of
 from service.core.records.events import AccountChanged
-from service.core.text.words import reason_of
 from service.people.credentials import (
     Passwords,
     ShortSecrets,

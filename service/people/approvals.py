@@ -8,9 +8,10 @@ from difflib import unified_diff
 from sqlalchemy import select
 
 from service.core.errors import ConfigurationError
-from service.core.protocol.models import LoadedProtocol
-from service.core.records.events import Event, Identified, ProtocolApproved
-from service.core.text.words import reason_of
+from service.core.protocol import LoadedProtocol
+from service.core.records.entered import reason_of
+from service.core.records.events import Event, ProtocolApproved
+from service.core.records.run_events import Identified
 from service.store.database.tables import event_index, events
 from service.store.events import to_event
 from service.store.records import SITE

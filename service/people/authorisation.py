@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.errors import ConfigurationError
-from service.core.gates.acceptance import demanded_role
-from service.core.protocol.models import Protocol
+from service.core.gates import demanded_role
+from service.core.protocol import Protocol
+from service.core.records.entered import cleaned_name, person_name
 from service.core.run.state import RunState
-from service.core.text.person_names import cleaned_name, person_name
 from service.people.person import ROLES, NotAllowedError, Permission, may
 from service.people.rows import plain_name
 from service.people.sessions import KnownBy, People

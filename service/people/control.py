@@ -10,8 +10,8 @@ from typing import Any, Literal
 from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from service.core.records.base import age_s
-from service.core.records.events import ControlTaken
-from service.core.text.words import reason_of
+from service.core.records.entered import reason_of
+from service.core.records.run_events import ControlTaken
 from service.people.person import AccountError, ControlError, NotAllowedError, Person
 from service.people.rows import SESSION_S
 from service.store.database.tables import accounts, control, runs, sessions

@@ -9,8 +9,8 @@ from typing import Any, cast
 from sqlalchemy import Connection, Row, delete, select
 
 from service.core.errors import ConfigurationError
+from service.core.records.entered import looks_of, person_name
 from service.core.records.events import AccountChanged, Event, SignInRecorded
-from service.core.text.person_names import looks_of, person_name
 from service.people.person import Account, AccountError, Person, Role
 from service.store.database.tables import accounts, sessions
 from service.store.events import sha256_text

@@ -13,12 +13,13 @@ from typing import Protocol as Interface
 from drivers.errors import DeviceError
 from drivers.machine_pressure import HeldUp
 from service.core.errors import OrthocaptureError, UnforeseenError
-from service.core.protocol.models import Protocol, Step
+from service.core.protocol import Protocol, Step
 from service.core.records.base import recorded
-from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured, StepNote
+from service.core.records.events import Payload
+from service.core.records.run_events import DeviceTrouble, StepFailed, StepMeasured, StepNote
 from service.core.recovery import TRIED_AGAIN, recovery_policy
 from service.core.run.state import JobState
-from service.core.text.words import counted
+from service.core.words import counted
 from service.logs.file_log import at
 from service.monitor.snapshot import living_workers
 from service.runner.held_run import HeldRun

@@ -7,7 +7,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from service.core.protocol.models import Protocol
+from service.core.protocol import Protocol
 from service.core.records.events import Payload
 from service.core.run.state import RunState
 from service.followed_run import RunFollower

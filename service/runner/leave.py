@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.errors import LeaveNeededError
-from service.core.protocol.models import Protocol
+from service.core.protocol import Protocol
 from service.core.records.base import Moment, elapsed
-from service.core.records.events import LeaveLapsed
+from service.core.records.run_events import LeaveLapsed
 from service.core.run.expected import failed_words
 from service.core.run.state import Leave, RunState
 from service.monitor.host import processor_s

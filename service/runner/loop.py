@@ -12,10 +12,10 @@ from os import getpid
 from drivers.errors import DeviceChangedError
 from drivers.interfaces import DeviceReport, PedalReading
 from service.core.errors import OrthocaptureError
-from service.core.gates.verdict import describe_judged
-from service.core.protocol.models import Protocol
+from service.core.gates import describe_judged
+from service.core.protocol import Protocol
 from service.core.recorded_devices import CHANGED, NOT_CALIBRATED, exchanged, exchanged_words, recorded_report
-from service.core.records.events import (
+from service.core.records.run_events import (
     ActionRefused,
     DeviceOpened,
     DeviceTrouble,
@@ -40,8 +40,7 @@ from service.core.run.decide import (
     evaluate_gates,
 )
 from service.core.run.expected import tries_words
-from service.core.run.noted import HandWork
-from service.core.run.state import RunState
+from service.core.run.state import HandWork, RunState
 from service.monitor.host import host_clock
 from service.runner.execution import Starvation, StepExecution, WorkerWatch, held_up_here
 from service.runner.held_run import HeldRun, held_run

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 from typing import Protocol as Interface
 
-from service.core.records.events import OperatorAction
+from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
-from service.core.run.noted import HandWork
-from service.core.run.state import RunState
+from service.core.run.state import HandWork, RunState
 from service.monitor.snapshot import Doing
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.errors import DeviceError
-from service.core.clocks import clock_readings
 from service.core.disk_space import Forecast, Verdict
 from service.core.errors import IntegrityError, StoreError
-from service.core.protocol.models import Protocol
-from service.core.records.events import DeviceTrouble, StepNote
+from service.core.protocol import Protocol
+from service.core.recorded_devices import clock_readings
+from service.core.records.run_events import DeviceTrouble, StepNote
 from service.followed_run import RunFollower
 from service.runner.held_run import HeldRun
 from service.runner.operator import Operator

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from service.core.declared_kinds import KindsOnDemand
-from service.core.protocol.step_params import StepParams
+from service.core.loading import KindsOnDemand
+from service.core.step_params import StepParams
 from service.steps.context import StepKind
 
 GROUP = "orthocapture.steps"  # entry points of plug-ins; each names a StepKind

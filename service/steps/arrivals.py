@@ -15,7 +15,8 @@ from drivers.interfaces import CtSource, DeviceReport, ScannedMesh
 from drivers.meshes.foreign_text import name_of
 from drivers.meshes.polygons import in_doubt
 from service.computations.records import JudgedLayout
-from service.core.records.events import ArtefactRef, FilesKept, Uncertainty
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import FilesKept, Uncertainty
 from service.steps.context import StepContext
 from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact

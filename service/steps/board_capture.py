@@ -16,11 +16,11 @@ from service.compute.board.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import Order, best_posture
 from service.core.errors import ComputeError
-from service.core.gates.verdict import describe, evaluate_gates
+from service.core.gates import describe, evaluate_gates
 from service.core.geometry import Array, Transform, apply, inverse
-from service.core.records.events import GateVerdict, ViewpointCaptured
+from service.core.records.run_events import GateVerdict, ViewpointCaptured
 from service.core.run.state import JobState
-from service.core.text.words import counted
+from service.core.words import counted
 from service.steps.board_plan import (
     START,
     Planner,

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
-from service.core.protocol.models import Protocol, Step
+from service.core.protocol import Protocol, Step
 from service.core.records.base import Elapsed, Moment, elapsed
 from service.core.run.state import RunState
 from service.steps.kinds import scan_import, timed_application

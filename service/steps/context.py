@@ -26,14 +26,15 @@ from service.computations.kind import JobKind, JobRecord
 from service.computations.memory_grants import waiting_for_memory
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.jobs import Each, Reference, answered_by, arguments_name, job_key
-from service.core.protocol.models import Protocol as LabProtocol
-from service.core.protocol.models import Step
-from service.core.protocol.step_params import StepParams
-from service.core.records.base import Moment
-from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record, RecordedView, StepNote, Uncertainty
+from service.core.protocol import Protocol as LabProtocol
+from service.core.protocol import Step
+from service.core.records.base import ArtefactRef, Moment, Record
+from service.core.records.events import Payload
 from service.core.records.import_list import ImportList
+from service.core.records.run_events import ComputedBy, RecordedView, StepNote, Uncertainty
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import WAITED, JobState
+from service.core.step_params import StepParams
 from service.followed_run import RunFollower
 from service.rig import CollisionSection, FurtherCameraSection, LensSection, ObstacleSection, OpticsSection
 from service.steps.measures import MeasureRecord

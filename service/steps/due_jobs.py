@@ -26,8 +26,8 @@ from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
 from service.core.jobs import Jobs, Reference, job_key, jobs_of, newest_job
-from service.core.protocol.models import Protocol, Step
-from service.core.records.events import ViewpointCaptured
+from service.core.protocol import Protocol, Step
+from service.core.records.run_events import ViewpointCaptured
 from service.core.run.state import EARLY, LATER, WAITED, JobState, RunState
 from service.steps.context import EarlierAnswer, JobRequest, StepContext
 from service.steps.registration import RegistrationParams, evaluated_step, evaluations_of

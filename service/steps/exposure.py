@@ -18,7 +18,8 @@ from drivers.stated_settings import agrees
 from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
-from service.core.records.events import ArtefactRef, FurtherExposure, Matrix4, ViewpointCaptured
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import FurtherExposure, Matrix4, ViewpointCaptured
 from service.steps.context import FurtherCamera, StepContext
 from service.steps.motion import settle_criteria
 from service.steps.viewpoints import Viewpoint

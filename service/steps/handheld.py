@@ -12,12 +12,12 @@ from pydantic import Field
 from service.computations import calibrate, coverage_points, hand_board, hand_view, layout
 from service.computations.records import Limits, Point, image_of
 from service.core.errors import ConfigurationError
-from service.core.gates.verdict import evaluate_gates
+from service.core.gates import evaluate_gates
 from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
-from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, NeededDevice, RepeatedStep, StepParams
-from service.core.records.events import Record, ViewHeld
-from service.core.records.optics import RecordedOptics
+from service.core.records.base import Record
+from service.core.records.run_events import RecordedOptics, ViewHeld
 from service.core.run.state import JobState
+from service.core.step_params import NAMES_CALIBRATION, NAMES_SPHERES, NeededDevice, RepeatedStep, StepParams
 from service.core.units import metres, rad_of_mrad
 from service.steps.context import JobRequest, StepContext, StepOutcome
 from service.steps.exposure import wanted_settings

@@ -17,7 +17,7 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.interfaces import Camera, CapturedImage
-from service.core.records.events import ViewHeld, ViewpointFailed
+from service.core.records.run_events import ViewHeld, ViewpointFailed
 from service.core.run.state import WAITING_FOR_HAND
 from service.steps.context import StepContext
 from service.steps.exposure import camera_record, environment_now, put_image, settings_agree, wanted_settings

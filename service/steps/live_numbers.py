@@ -12,13 +12,14 @@ from pydantic import Field
 from service.computations import calibrate, coverage_points, further_view, live_summary, live_view, locate_spheres
 from service.computations.records import Hash, ImageFile, Limits, Mounting, Point, PosedPhotograph, image_of
 from service.core.errors import ComputeError, ConfigurationError
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import limits as gate_text
+from service.core.gates import limits as gate_text
 from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
-from service.core.protocol.models import Gate
-from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_CT
-from service.core.records.events import FurtherExposure, Record, RecordedView, ViewpointCaptured
+from service.core.measure_names import measure_name
+from service.core.protocol import Gate
+from service.core.records.base import Record
+from service.core.records.run_events import FurtherExposure, RecordedView, ViewpointCaptured
 from service.core.run.state import LIVE, JobState
+from service.core.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_CT
 from service.core.units import metres, rad_of_mrad
 from service.steps.context import JobRequest, StepContext
 from service.steps.notes import SPOILT, SUGGESTION, suggested_views

@@ -20,7 +20,7 @@ class Measure:
     unit: str
     least: float = 0.0
     most: float = float("inf")
-    meaning: str = ""  # one sentence, for the page of the step kinds; its name: service/core/gates/measure_names.py
+    meaning: str = ""  # one sentence, for the page of the step kinds; its name: service/core/measure_names.py
 
 
 class MeasureRecord(Record):

@@ -23,12 +23,11 @@ from service.compute.planning.motion_plan import (
     plan_motion,
     travel_times_s,
 )
-from service.core.arms.model import ArmModel, known_arm
-from service.core.arms.motion_limits import motion_problems
+from service.core.arms import ArmModel, known_arm
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
-from service.core.protocol.models import Motion
-from service.core.run import noted
+from service.core.protocol import Motion, motion_problems
+from service.core.run.state import MOTION_PLAN, NotedStation, NotedView
 from service.core.units import metres, metres_of_um
 from service.rig import CollisionSection, OpticsSection
 from service.steps.context import StationLayout, StepContext, StepInterruptedError
@@ -50,7 +49,7 @@ class StepPlan:
     viewpoints: tuple[Viewpoint, ...]  # in order; refused ones last
     refused: Mapping[str, str]
     text: str
-    motions: tuple[noted.NotedStation, ...]  # where the arm's kinematics are known
+    motions: tuple[NotedStation, ...]  # where the arm's kinematics are known
     starts_rad: Mapping[str, Array] = field(default_factory=dict[str, Array])  # joints at the start, by station
 
 
@@ -239,7 +238,7 @@ def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
     )
     if whole.motions:
         stations = [station.model_dump(mode="json") for station in whole.motions]
-        context.note(noted.MOTION_PLAN, text=whole.text, stations=stations)
+        context.note(MOTION_PLAN, text=whole.text, stations=stations)
     if whole.text:
         context.tell(whole.text)
     return whole
@@ -305,8 +304,8 @@ def _text(plan: MotionPlan) -> str:
     return "; ".join(parts)
 
 
-def _station(plan: MotionPlan, station: str) -> noted.NotedStation:
-    return noted.NotedStation(
+def _station(plan: MotionPlan, station: str) -> NotedStation:
+    return NotedStation(
         station=station,
         order=plan.order,
         estimated_s=round(plan.total_s, 1),
@@ -314,9 +313,9 @@ def _station(plan: MotionPlan, station: str) -> noted.NotedStation:
     )
 
 
-def _view(view: PlannedView) -> noted.NotedView:
+def _view(view: PlannedView) -> NotedView:
     refused = view.outcome == "refused"
-    return noted.NotedView(
+    return NotedView(
         viewpoint=view.name,
         outcome=view.outcome,
         reason=view.reason,

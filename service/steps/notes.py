@@ -9,10 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.computations.live_summary import Suggestion
 from service.computations.records import Matrix
-from service.core.protocol.models import Step
+from service.core.protocol import Step
 from service.core.recovery import planned_views
 from service.core.run.state import StepState
-from service.core.text.words import counted
+from service.core.words import counted
 from service.steps.viewpoints import viewpoint_name
 
 BOARD_POSES, SUGGESTION = "board_poses", "suggested_viewpoints"

@@ -10,10 +10,10 @@ import numpy as np
 from service.compute.board.board import Board
 from service.compute.board.design import CalibrationTargets
 from service.compute.planning.motion_plan import best_posture
-from service.core.arms.model import known_arm
+from service.core.arms import known_arm
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply
-from service.core.protocol.models import Protocol, Step
+from service.core.protocol import Protocol, Step
 from service.core.units import metres
 from service.rig import Rig
 from service.steps.board_plan import (

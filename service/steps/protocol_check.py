@@ -10,12 +10,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 
-from service.core.arms.model import arm_model, known_arms
-from service.core.arms.motion_limits import motion_problems
+from service.core.arms import arm_model, known_arms
+from service.core.checked_yaml import FieldPath, Plain, YamlProblem, field_name, parse_yaml, refuse
 from service.core.errors import ConfigurationError, ProtocolError
-from service.core.protocol.models import Gate, LoadedProtocol, Protocol, Step
-from service.core.protocol.step_params import named_steps
-from service.core.text.checked_yaml import FieldPath, Plain, YamlProblem, field_name, parse_yaml, refuse
+from service.core.protocol import Gate, LoadedProtocol, Protocol, Step, motion_problems
+from service.core.step_params import named_steps
 from service.rig import Rig, RigDevice, RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures

@@ -19,11 +19,12 @@ from service.computations.register import ARM
 from service.compute.images.develop_parameters import PARAMETERS
 from service.core.errors import ConfigurationError
 from service.core.jobs import Each, Reference
-from service.core.protocol.models import Protocol, Step
-from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_SCAN, RepeatedStep, StepParams
-from service.core.records.events import ArtefactRef, Record, RecordedView, ViewHeld, ViewpointCaptured
-from service.core.text.words import counted
+from service.core.protocol import Protocol, Step
+from service.core.records.base import ArtefactRef, Record
+from service.core.records.run_events import RecordedView, ViewHeld, ViewpointCaptured
+from service.core.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.units import metres
+from service.core.words import counted
 from service.steps.context import JobRequest, StepContext
 
 References = dict[str, Reference | Each | None]  # what is recorded in the place of a job's arguments, by field

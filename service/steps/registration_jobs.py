@@ -31,8 +31,8 @@ from service.computations.kind import JobKind, JobRecord, read_part
 from service.computations.records import ImageFile, ImagesCamera, Matrix
 from service.compute.sfm.options import Mapper, SfmOptions, pairs_of
 from service.core.jobs import Each, Jobs, Reference, arguments_name, jobs_of, newest_job, references_in
-from service.core.protocol.models import Protocol, Step
-from service.core.records.events import FurtherExposure, ViewpointCaptured
+from service.core.protocol import Protocol, Step
+from service.core.records.run_events import FurtherExposure, ViewpointCaptured
 from service.core.run.state import EARLY, LATER, REDUCED, WAITED, JobState, RunState
 from service.steps.context import JobRequest, JobResult, StepContext
 from service.steps.registration import (

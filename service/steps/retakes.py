@@ -10,8 +10,8 @@ from pydantic import BaseModel
 from service.computations.records import image_of
 from service.compute.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
 from service.core.errors import ImagesSpoiltError
-from service.core.gates.verdict import describe, evaluate_gates
-from service.core.records.events import RecordedView
+from service.core.gates import describe, evaluate_gates
+from service.core.records.run_events import RecordedView
 from service.core.run.state import JobState
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING, SPOILT, images_to_repeat

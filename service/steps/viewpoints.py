@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from service.compute.board.view_range import ViewRange
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, Transform, inverse, look_at, transform
-from service.core.records.events import Record
+from service.core.records.base import Record
 from service.steps.context import StationLayout
 
 

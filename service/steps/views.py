@@ -22,7 +22,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
 from service.core.geometry import Array, Transform
-from service.core.records.events import ViewpointFailed
+from service.core.records.run_events import ViewpointFailed
 from service.core.units import megapixels
 from service.logs.file_log import at
 from service.steps.context import FurtherCamera, StepContext

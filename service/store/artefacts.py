@@ -14,8 +14,9 @@ from typing import Any, cast
 from sqlalchemy import Connection, Row, bindparam, insert, select
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import ArtefactRef, Event
-from service.core.shown_text import storable_data
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Event
+from service.core.words import storable_data
 from service.store.database.engine import RESTORE
 from service.store.database.tables import artefacts
 from service.store.durable_effects import Files, IdSource

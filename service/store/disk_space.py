@@ -14,7 +14,7 @@ from sqlalchemy import Connection, func, select, text
 
 from service.core.disk_space import LEAST_FREE_BYTES, Forecast, Usage, forecast, size_words
 from service.core.errors import SpaceShortError, StoreError
-from service.core.protocol.models import Protocol
+from service.core.protocol import Protocol
 from service.core.records.events import LeftoversRemoved
 from service.core.run.state import RunState
 from service.store.artefacts import TEMPORARY, alone_with, hash_file, relative_path

@@ -14,8 +14,9 @@ from pydantic_core import PydanticSerializationError, ValidationError
 from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
-from service.core.shown_text import storable, storable_data
+from service.core.records.base import ArtefactRef
+from service.core.records.events import PAYLOAD, Event, Payload
+from service.core.words import storable, storable_data
 from service.store.database.changes import notify
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text

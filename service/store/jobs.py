@@ -9,9 +9,10 @@ from typing import Any, cast
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
 
 from service.core.errors import IllegalTransitionError
-from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
+from service.core.records.events import Event
+from service.core.records.run_events import JobEnqueued, JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, Lane
-from service.core.shown_text import storable
+from service.core.words import storable
 from service.store.database.changes import notify
 from service.store.database.database import lease_now_s
 from service.store.database.tables import jobs

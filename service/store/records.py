@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.core.errors import StoreError
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.core.run.state import WAITED
 
 

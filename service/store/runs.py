@@ -14,7 +14,8 @@ import psutil
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from service.core.errors import StoreError
-from service.core.records.events import RunStarted, SiteOpened
+from service.core.records.events import SiteOpened
+from service.core.records.run_events import RunStarted
 from service.store.artefacts import ArtefactFiles, insert_artefacts
 from service.store.database.database import Database, is_postgres, lease_now_s
 from service.store.database.tables import event_facets, event_index, heads, leases, runs

@@ -13,9 +13,11 @@ from typing import Any, Self
 from sqlalchemy import Connection, bindparam, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.records.events import ArtefactRef, ComputedOn, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Event, Payload, SiteOpened
+from service.core.records.run_events import ComputedOn, JobFinished, RunStarted
 from service.core.run.state import Lane
-from service.core.shown_text import storable
+from service.core.words import storable
 from service.store import jobs as queue
 from service.store.access import close_to_others, require_access
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts

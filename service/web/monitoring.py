@@ -23,9 +23,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.core.clocks import ClockReading, clock_readings
 from service.core.disk_space import Forecast
 from service.core.errors import OrthocaptureError, StoreError
+from service.core.recorded_devices import ClockReading, clock_readings
 from service.monitor.figures import Figures, Health, read_figures, read_health
 from service.store.disk_space import forecast_of
 from service.web.security import Guard

@@ -9,9 +9,10 @@ from typing import Any
 
 from service.computations.job import JobAnswer
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.gates.release import late_s
+from service.core.gates import late_s
 from service.core.jobs import jobs_of, references_in, resolve
-from service.core.records.events import ComputedOn, Event
+from service.core.records.events import Event
+from service.core.records.run_events import ComputedOn
 from service.core.run.fold import advance
 from service.followed_run import RunFollower
 from service.run_record import recorded_protocol, recorded_root

@@ -21,7 +21,7 @@ from service.computations.kind import Demand
 from service.computations.memory_grants import MemoryGrants
 from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
-from service.core.records.events import ClusterHost, ComputedOn
+from service.core.records.run_events import ClusterHost, ComputedOn
 from service.core.run.state import Lane
 from service.logs.file_log import at
 from service.machine.executors import Place, noting_places

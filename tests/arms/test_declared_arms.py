@@ -20,11 +20,11 @@ from service.compute.planning.motion_plan import (
     best_posture,
     plan_motion,
 )
-from service.core.arms.model import ArmModel, arm_model, flange_pose, known_arms
-from service.core.arms.seven_axes import elbow_angle_rad
+from service.core.arms import ArmModel, arm_model, flange_pose, known_arms
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, inverse, to_rotation_vector, transform
-from service.core.protocol.models import Motion, load_protocol
+from service.core.protocol import Motion, load_protocol
+from service.core.seven_axes import elbow_angle_rad
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models

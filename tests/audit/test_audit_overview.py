@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from service.audit.overview.devices import clock_offsets
 from service.cli.main import app
-from service.core.gates.measure_names import measure_name
-from service.core.records.events import FilesKept, SessionStarted, StepStarted
-from service.core.text.words import local_time
+from service.core.measure_names import measure_name
+from service.core.records.run_events import FilesKept, SessionStarted, StepStarted
+from service.core.words import local_time
 from service.steps import step_kinds
 from service.store.records import NewArtefact
 from service.store.store import Store

@@ -23,10 +23,10 @@ from service.audit.report.course import incidents
 from service.audit.report.output import render_html
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.records.events import (
+from service.core.records.events import Event
+from service.core.records.run_events import (
     DeviceOpened,
     DeviceTrouble,
-    Event,
     EvidenceExported,
     LeaveLapsed,
     RobotSeen,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.followed_run import RunFollower, read_log
 from service.run_start import recorded_run
 from service.steps.context import Evidence

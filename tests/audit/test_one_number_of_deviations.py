@@ -18,7 +18,7 @@ from service.audit.report.output import render_html
 from service.cli.main import app
 from service.core.run.fold import fold
 from service.core.run.state import Deviation
-from service.core.text.words import counted
+from service.core.words import counted
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.run_data_set import data_set_of
 from service.run_start import recorded_run

@@ -21,7 +21,7 @@ from service.computations.job import Handler, JobAnswer, RecordedContext
 from service.computations.records import SpheresFound
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.jobs import Reference, jobs_of, references_in, resolve
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.worker import loop
 from tests.support.record.outsider import copy_data
 from tests.support.runs.recorded_run import record_run

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from service.audit.runs.history import by_instrument, history
 from service.cli.main import app
-from service.core.records.events import DeviceOpened
+from service.core.records.run_events import DeviceOpened
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.page.charts import TimePoint, time_chart

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from service.audit.record.run import read_run
 from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, replay
 from service.cli.main import app
-from service.core.records.events import JobEnqueued, JobFailed, JobFinished, RunCompleted
+from service.core.records.run_events import JobEnqueued, JobFailed, JobFinished, RunCompleted
 from service.monitor.snapshot import living_workers
 from service.store.durable_effects import SystemClock
 from service.store.store import Store

@@ -8,9 +8,16 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import OperatorAction, StepFailed, StepMeasured, StepNote, StepPassed, StepStarted
+from service.core.gates import evaluate_gates
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import (
+    OperatorAction,
+    StepFailed,
+    StepMeasured,
+    StepNote,
+    StepPassed,
+    StepStarted,
+)
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.pages.at_the_table import STANDING, at_the_table, record

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Page, expect
 
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import OperatorAction, StepNote
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import OperatorAction, StepNote
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from service.core.records.entered import NoteTaken
-from service.core.records.events import RunStarted
+from service.core.records.run_events import RunStarted
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.accounts import add_people

@@ -13,7 +13,7 @@ import pytest
 from fastapi.routing import iter_route_contexts
 from playwright.sync_api import Browser, Page, Route, expect
 
-from service.core.records.events import OperatorAction
+from service.core.records.run_events import OperatorAction
 from service.people.person import Role
 from service.store.store import Store
 from tests.support.pages.browser import (

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from service.core.geometry import Array, apply
-from service.core.records.events import RegionDrawn
+from service.core.records.run_events import RegionDrawn
 from service.dataset.scene_view import viewing_frame
 from service.followed_run import read_log
 from service.run_start import recorded_run

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.store.store import Store
 from tests.support.pages.accounts import PASSWORD, PIN, invite_people
 from tests.support.pages.browser import (

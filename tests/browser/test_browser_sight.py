@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Page, expect
 
-from service.core.records.events import OperatorAction, StepFailed, StepStarted
+from service.core.records.run_events import OperatorAction, StepFailed, StepStarted
 from service.monitor.snapshot import write_frame
 from tests.support.pages.at_the_table import at_the_table, record
 from tests.support.pages.browser import TABLET, Served, screen, served

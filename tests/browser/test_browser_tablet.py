@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Page, expect
 
-from service.core.records.events import OperatorAction, StepFailed, StepStarted
+from service.core.records.run_events import OperatorAction, StepFailed, StepStarted
 from tests.support.pages.at_the_table import at_the_table, record
 from tests.support.pages.browser import Served, follow, screen, served
 from tests.support.pages.shown_site import skip

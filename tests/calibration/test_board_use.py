@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import StepStarted
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import StepStarted
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

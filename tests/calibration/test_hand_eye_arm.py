@@ -31,7 +31,7 @@ from service.compute.hand_eye.reprojection import BoardCorners
 from service.compute.hand_eye.setup import robust_start
 from service.compute.poses.pose_files import write_poses_csv
 from service.compute.poses.robot_files import read_joints_csv
-from service.core.arms.model import ArmModel, arm_model
+from service.core.arms import ArmModel, arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from simulators.scene.arm import ARM_ERRORS, ArmErrorKind, ArmErrors, perturbed_forward

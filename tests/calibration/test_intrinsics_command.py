@@ -20,9 +20,9 @@ from service.compute.intrinsics.optics import Optics, compare_optics
 from service.compute.poses.camera_files import read_camera_json
 from service.core.errors import DataError
 from service.core.geometry import transform
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.core.records.base import Moment
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.steps import params_models
 from service.steps.context import StepContext
 from service.steps.retakes import departing_images, optics_departures

@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 from service.cli.common import console
 from service.cli.main import app
-from service.core.records.events import ActionRefused, OperatorAction
+from service.core.records.run_events import ActionRefused, OperatorAction
 from service.store.store import Store
 from tests.support.runs.bench_run import PROTOCOL, record_runs
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
 from service.cli.terminal_output import Terminal
-from service.core.shown_text import shown
+from service.core.words import shown
 from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.signatures.second_place import SecondPlace, away_words
 from tests.support.hostile_places import PAGES, READING, elements_made, read_by, record_of_hostile_texts, settled

@@ -18,7 +18,7 @@ import typer
 from service.cli.main import app
 from service.computations import job_kinds
 from service.core.loading import end_loading, loading
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models, step_kinds

@@ -23,7 +23,7 @@ from service.compute.board.search import find_boards
 from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, ConfigurationError, DataError
-from service.core.records.events import JobFailed, JobFinished
+from service.core.records.run_events import JobFailed, JobFinished
 from service.machine.executors import (
     VARIABLE,
     computing_as_environment_says,

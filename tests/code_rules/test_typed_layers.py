@@ -40,7 +40,7 @@ EDGES = {
     "service/compute/markers/records.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
     "service/compute/poses/camera_files.py": "reads JSON files",
-    "service/core/protocol/models.py": "the JSON schema of a protocol",
+    "service/core/protocol.py": "the JSON schema of a protocol",
     "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",
     "service/dataset/crate.py": "writes ro-crate-metadata.json",

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from service.core.errors import IntegrityError
-from service.core.records.events import (
+from service.core.records.events import Payload
+from service.core.records.run_events import (
     OperatorAction,
-    Payload,
     RunCompleted,
     StepFailed,
     StepMeasured,

@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 
 import pytest
 
-from service.core.records.events import LeaveLapsed, StepMeasured
+from service.core.records.run_events import LeaveLapsed, StepMeasured
 from service.core.run.expected import away_words, run_words, step_words, work_words
 from service.monitor.figures import read_step_times
 from tests.support.record.core import GOOD, TOY, Log, toy_protocol

@@ -7,15 +7,9 @@ import pytest
 import drivers.errors as device_errors
 import service.core.errors as core_errors
 from service.core.errors import IntegrityError
-from service.core.gates.verdict import describe, quantity, uncertain
-from service.core.protocol.models import Recovery
-from service.core.records.events import (
-    RunAborted,
-    StepMeasured,
-    StepRetried,
-    Uncertainty,
-    ViewpointFailed,
-)
+from service.core.gates import describe, quantity, uncertain
+from service.core.protocol import Recovery
+from service.core.records.run_events import RunAborted, StepMeasured, StepRetried, Uncertainty, ViewpointFailed
 from service.core.recovery import NEEDS_A_PERSON, TRIED_AGAIN, recovery_policy, ways_on
 from service.core.run.decide import (
     Halt,

@@ -8,7 +8,7 @@ import pickle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.core.run.persistent_map import PersistentMap, put
+from service.core.run.effects import PersistentMap, put
 
 KEYS = st.sampled_from(["a", "b", "c", "d"])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from service.core.errors import IntegrityError
-from service.core.gates.release import release_meaning
-from service.core.records.events import (
+from service.core.gates import release_meaning
+from service.core.records.run_events import (
     ActionRefused,
     OperatorAction,
     RunAborted,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 
 from service.core.records.base import recorded
-from service.core.records.events import ViewImported
-from service.core.records.optics import RecordedOptics
+from service.core.records.run_events import RecordedOptics, ViewImported
 
 PHOTOGRAPH = ViewImported(
     step="photographs", attempt=1, viewpoint="IMG_1", station="", artefacts=(), camera={}, imported_by="Ada",

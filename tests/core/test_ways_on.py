@@ -18,12 +18,12 @@ from drivers.errors import DeviceFaultError
 from service.cli.main import app
 from service.core import errors as core_errors
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
-from service.core.protocol.models import irreversible_warning, parse_protocol
-from service.core.protocol.step_params import StepParams
-from service.core.records.events import OperatorAction, OperatorVerb, StepNote
+from service.core.protocol import irreversible_warning, parse_protocol
+from service.core.records.run_events import OperatorAction, OperatorVerb, StepNote
 from service.core.recovery import NEEDS_A_PERSON, REMEDIES, WayOn, takes_words, view_s, ways_on
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
+from service.core.step_params import StepParams
 from service.runner.operator import AnswerBy
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome

@@ -19,7 +19,7 @@ from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output import render_html
 from service.core.geometry import Array, apply, inverse, transform
-from service.core.records.events import FilesKept
+from service.core.records.run_events import FilesKept
 from service.core.run.state import RunState
 from service.store.verification.verify import verify
 from simulators.ct_suite.suite import write_series

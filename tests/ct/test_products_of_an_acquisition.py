@@ -16,7 +16,7 @@ from drivers.dicom_folder import DicomFolderConfig
 from drivers.dicom_folder.folder import DicomFolder
 from drivers.interfaces import CtSource
 from service.core.errors import DataError
-from service.core.records.events import FilesKept
+from service.core.records.run_events import FilesKept
 from service.import_folder import CtReading, ImportFolders, import_rig, list_import
 from simulators.ct_suite.suite import PRODUCTS, Product, write_products
 from simulators.ct_suite.volume import Grid

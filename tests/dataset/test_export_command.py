@@ -17,7 +17,7 @@ from service.audit.record.run import read_run
 from service.cli.main import app
 from service.compute.pixels.masks import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse
-from service.core.records.events import EvidenceExported, RunCompleted, RunReleased
+from service.core.records.run_events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
 from service.dataset.posts import upwards
 from service.dataset.records import Mesh

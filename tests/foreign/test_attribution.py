@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from service.core.errors import DataError
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.core.records.data_set import DataSetStatement, Party, doi_address, licence_address, party
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.records import About, DataSet

@@ -13,7 +13,7 @@ import pytest
 from service.compute.poses.pose_files import read_poses
 from service.compute.poses.robot_files import read_joints_csv, read_stations
 from service.core.errors import DataError
-from service.core.text.delimited_text import TextTable, read_table
+from service.core.text_files import TextTable, read_table
 
 POSE = (0.25, -1.5, 0.125)  # x y z; the quaternion is that of no rotation
 DOTS = ("0.25", "-1.5", "0.125", "0", "0", "0", "1.0")

@@ -17,8 +17,8 @@ from drivers.errors import UnreadableFileError
 from drivers.interfaces import CtSource, Scanner
 from drivers.photos.photo_file import exiv2, read_exif
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
-from service.core.records.events import DeviceOpened, StepFailed
 from service.core.records.import_list import ImportList
+from service.core.records.run_events import DeviceOpened, StepFailed
 from tests.support.ct.ct_series import write_series
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench, begin_run, bench_store, say

@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.meshes.companions import companion_names, companions
 from drivers.meshes.mesh_file import read_mesh_file
-from service.core.records.events import FilesKept
+from service.core.records.run_events import FilesKept
 from service.dataset.run_data_set import scan_files
 from service.dataset.summary import summarise
 from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres

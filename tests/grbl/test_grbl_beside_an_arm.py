@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.geometry import inverse
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
 from tests.support.protocols.one_side import VIEWS, one_side
 from tests.support.rig.patience import PATIENT_GRBL

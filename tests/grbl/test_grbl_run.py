@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from service.core.geometry import inverse, rotation_angle_rad
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.store.store import Store
 from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
 from tests.support.rig.patience import PATIENT_GRBL

@@ -19,10 +19,10 @@ from service.computations.job import JobContext
 from service.compute.ground_truth.surface import Surface, read_ply
 from service.core.errors import ProtocolError
 from service.core.geometry import inverse, transform
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import RegionDrawn
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import RegionDrawn
 from service.core.run.state import RunState
-from service.core.text.words import SIMULATED
+from service.core.words import SIMULATED
 from service.dataset.about_run import about_run
 from service.dataset.preview_surfaces import SimplifiedMesh, fused_mesh, shown_distances
 from service.dataset.summary import recorded_fusion, summarise

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
-from service.core.records.events import CaptureAsked, OperatorAction, StepMeasured, ViewHeld, ViewpointFailed
+from service.core.records.run_events import CaptureAsked, OperatorAction, StepMeasured, ViewHeld, ViewpointFailed
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from simulators.hand.technician import follow

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.core.geometry import inverse
-from service.core.records.events import CaptureAsked, StepFailed, StepMeasured, ViewHeld
+from service.core.records.run_events import CaptureAsked, StepFailed, StepMeasured, ViewHeld
 from simulators.hand.technician import Grip
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import Bench, begin_run, bench_store

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.video import VideoCamera, VideoConfig
-from service.core.records.events import CaptureAsked, ViewHeld
+from service.core.records.run_events import CaptureAsked, ViewHeld
 from simulators.hand.technician import Grip
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import Bench, begin_run, bench_store

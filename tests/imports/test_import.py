@@ -17,10 +17,15 @@ from typer.testing import CliRunner
 from service.cli.demo import true_error_mm
 from service.cli.main import app
 from service.core.errors import DataError
-from service.core.protocol.models import load_protocol
-from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
+from service.core.protocol import load_protocol
 from service.core.records.import_list import FileRole, PhotographRole
-from service.core.records.optics import RecordedOptics
+from service.core.records.run_events import (
+    OperatorAction,
+    RecordedOptics,
+    RunStarted,
+    ViewImported,
+    ViewpointCaptured,
+)
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.run_data_set import data_set_of
 from service.dataset.summary import summarise

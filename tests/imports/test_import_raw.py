@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from service.core.records.events import JobEnqueued, JobFinished
+from service.core.records.run_events import JobEnqueued, JobFinished
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.rig.rig import REPOSITORY, orthocapture

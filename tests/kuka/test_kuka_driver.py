@@ -23,10 +23,10 @@ from drivers.errors import (
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCriteria
 from drivers.kuka import KukaConfig
-from service.core.arms.model import arm_model
-from service.core.arms.model import flange_pose as forward
-from service.core.arms.seven_axes import nearest_posture, postures
+from service.core.arms import arm_model
+from service.core.arms import flange_pose as forward
 from service.core.geometry import inverse, rotation_angle_rad, transform
+from service.core.seven_axes import nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames
 from tests.support.arms.confirming import confirm_and
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka

@@ -28,8 +28,8 @@ from drivers.kuka.fri.listener import Listener
 from drivers.kuka.fri.protobuf import fields, message_field, number_field
 from drivers.kuka.fri.sample import unpack
 from drivers.kuka.fri.wire import FriError, Monitoring, decode, reply
-from service.core.arms.model import arm_model
-from service.core.arms.model import flange_pose as forward
+from service.core.arms import arm_model
+from service.core.arms import flange_pose as forward
 from tests.support.arms.kuka_simulator import pendant, simulated_kuka, transcript
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.below import processes_below

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from service.computations import calibrate
-from service.core.records.events import JobEnqueued, ViewpointCaptured
+from service.core.records.run_events import JobEnqueued, ViewpointCaptured
 from tests.support.protocols.small_demo import COARSE
 from tests.support.protocols.two_arms import FIRST, SECOND, for_two_arms, kuka_demo
 from tests.support.rig.rig import orthocapture, simulated_rig

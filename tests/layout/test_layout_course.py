@@ -10,8 +10,8 @@ import pytest
 
 from service.computations.job import JobAnswer, RecordedContext
 from service.computations.layout import Answer, LayoutDetails
-from service.core.records.events import JobFinished, OperatorAction, StepMeasured, StepNote, StepPassed
-from service.core.records.events import Uncertainty as Bounds
+from service.core.records.run_events import JobFinished, OperatorAction, StepMeasured, StepNote, StepPassed
+from service.core.records.run_events import Uncertainty as Bounds
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Snapshot, write_snapshot

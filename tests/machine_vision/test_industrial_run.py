@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from service.core.geometry import Transform, inverse, rotation_angle_rad
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.dataset.summary import summarise
 from service.run_start import recorded_run
 from service.steps.kinds.calibration import Result

@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from service.cli.run import worker_beside
-from service.core.records.events import JobFailed
+from service.core.records.run_events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.processes.below import processes_below

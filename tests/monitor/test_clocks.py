@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from drivers.interfaces import DeviceReport
-from service.core.clocks import ClockReading, clock_readings
-from service.core.records.events import DeviceOpened, HostClock, Payload, SessionStarted
+from service.core.recorded_devices import ClockReading, clock_readings
+from service.core.records.events import Payload
+from service.core.records.run_events import DeviceOpened, HostClock, SessionStarted
 from service.monitor.host import host_clock
 from service.store.records import NewArtefact
 from service.store.store import Store

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.core.records.events import DeviceOpened, DeviceTrouble
+from service.core.records.run_events import DeviceOpened, DeviceTrouble
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.durable_effects import SystemClock
 from service.store.records import NewJob

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from service.cli.act import ACTS
 from service.cli.main import app
-from service.core.records.events import (
+from service.core.records.run_events import (
     DeviceTrouble,
     ItemTicked,
     OperatorVerb,

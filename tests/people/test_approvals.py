@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import ConfigurationError
-from service.core.protocol.models import LoadedProtocol, parse_protocol
+from service.core.protocol import LoadedProtocol, parse_protocol
 from service.core.records.events import ProtocolApproved
 from service.people.approvals import approve, difference, standing_of
 from service.steps import params_models

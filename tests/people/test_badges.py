@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import AccountChanged, OperatorAction
+from service.core.records.events import AccountChanged
+from service.core.records.run_events import OperatorAction
 from service.people.person import AccountError, Role, SignInRefusedError
 from service.people.sessions import KnownBy
 from service.people.tries import FREE_FAILURES

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from service.audit.verify.verifications import Verifications
 from service.cli.main import app
 from service.core.errors import ConfigurationError
-from service.core.text.person_names import NAME_CHARACTERS, cleaned_name, looks_of, person_name
+from service.core.records.entered import NAME_CHARACTERS, cleaned_name, looks_of, person_name
 from service.people.person import AccountError
 from service.people.sessions import People
 from service.store.records import SITE

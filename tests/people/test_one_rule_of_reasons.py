@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from service.audit.overview.findings import correct
 from service.cli.main import app
 from service.core.errors import OrthocaptureError
-from service.core.text.words import REASON_CHARACTERS
+from service.core.records.entered import REASON_CHARACTERS
 from service.people.control import Control
 from service.run_acts import cancel_computation
 from service.store.records import NewJob

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import ControlTaken
+from service.core.records.run_events import ControlTaken
 from service.people.control import Control
 from service.people.person import AccountError, ControlError, NotAllowedError, Person
 from service.people.sessions import People

@@ -12,7 +12,7 @@ from service.audit.record.run import RecordedFiles
 from service.audit.replay.recomputed import ScratchStore
 from service.computations.job import JobContext, RecordedContext
 from service.compute.sfm.options import SfmOptions, pairs_of
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.worker.loop import HANDLERS
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 

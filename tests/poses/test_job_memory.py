@@ -14,7 +14,7 @@ from service.computations.job import JobAnswer, RecordedContext
 from service.computations.kind import Demand
 from service.computations.memory_grants import ALONE, Grant, MemoryGrants, waiting_for_memory
 from service.core.errors import ComputeError, IllegalTransitionError
-from service.core.records.events import JobFailed
+from service.core.records.run_events import JobFailed
 from service.machine.resources import MachineMemory, machine_memory, processes_for
 from service.store.records import LeaseLostError, NewJob
 from service.store.store import Store

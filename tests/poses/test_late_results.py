@@ -26,12 +26,12 @@ from service.audit.overview.digest import Digest, digests
 from service.audit.verify.bundle_verifier import main as verify_bundle
 from service.cli.operators import Display
 from service.cli.run import wait_for_results
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import (
+from service.core.gates import evaluate_gates
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.events import Payload
+from service.core.records.run_events import (
     FilesKept,
     OperatorAction,
-    Payload,
     RunCompleted,
     StepMeasured,
     StepNote,

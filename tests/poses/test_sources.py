@@ -11,11 +11,12 @@ import pytest
 
 from service.cli.status import status_record
 from service.computations import job_kinds
-from service.core.gates.release import late_s, late_words
+from service.core.gates import late_s, late_words
 from service.core.geometry import look_at
 from service.core.jobs import Reference
-from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
-from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished
+from service.core.protocol import LoadedProtocol, Protocol, load_protocol, parse_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import JobEnqueued, JobFinished
 from service.core.run.fold import fold, initial_state
 from service.core.run.state import LATER, REDUCED, WAITED, JobState, Note, RunState
 from service.dataset.registrations import better_later, evaluated, own_registration, registrations

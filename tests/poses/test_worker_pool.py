@@ -14,7 +14,7 @@ import pytest
 
 from service.computations.job import JobAnswer, RecordedContext
 from service.core.errors import ComputeError, StoreError
-from service.core.records.events import JobFailed, JobFinished, StepNote
+from service.core.records.run_events import JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, LATER, LIVE, WAITED
 from service.store.records import Job, NewJob
 from service.store.store import Store

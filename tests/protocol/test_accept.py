@@ -18,10 +18,9 @@ from service.cli.main import app
 from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import ProtocolError
-from service.core.gates.acceptance import dependent_steps, depends_on
-from service.core.protocol.models import load_protocol
-from service.core.protocol.rules import NEVER_ACCEPTED
-from service.core.records.events import ActionRefused, OperatorAction
+from service.core.gates import dependent_steps, depends_on
+from service.core.protocol import NEVER_ACCEPTED, load_protocol
+from service.core.records.run_events import ActionRefused, OperatorAction
 from service.core.run.actions import allowed_actions, unmet_requirements
 from service.core.run.decide import AskOperator
 from service.core.run.fold import fold

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.steps import params_models
 
 PROTOCOLS = Path(__file__).parents[2] / "protocols"

@@ -17,8 +17,8 @@ from service.audit.report.content import report_content
 from service.audit.report.output import render_html
 from service.cli.common import console
 from service.cli.main import app
-from service.core.gates.verdict import describe, describe_judged, figure, quantity, standing
-from service.core.records.events import GateVerdict, Uncertainty
+from service.core.gates import describe, describe_judged, figure, quantity, standing
+from service.core.records.run_events import GateVerdict, Uncertainty
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.run_data_set import data_set_of
 from service.store.store import Store

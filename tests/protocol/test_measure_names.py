@@ -7,9 +7,9 @@ import pytest
 from docs.generate.pages import shipped_protocols
 from docs.generate.steps import measures_of_kind, steps_text
 from service.audit.report.blocks import measured
-from service.core.gates.measure_names import MEASURE_NAMES, REGISTRATION_MEASURE_NAMES, measure_name
-from service.core.gates.verdict import describe
-from service.core.records.events import GateVerdict
+from service.core.gates import describe
+from service.core.measure_names import MEASURE_NAMES, REGISTRATION_MEASURE_NAMES, measure_name
+from service.core.records.run_events import GateVerdict
 from service.steps import step_kinds
 from service.web.page.run_frame import figure_line, limit
 

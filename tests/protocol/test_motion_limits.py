@@ -9,10 +9,9 @@ from typer.testing import CliRunner
 
 from drivers.interfaces import Abandoned
 from service.cli.main import app
-from service.core.arms.model import ArmModel, known_arms
-from service.core.arms.motion_limits import motion_problems
+from service.core.arms import ArmModel, known_arms
 from service.core.errors import OrthocaptureError
-from service.core.protocol.models import Motion, load_protocol
+from service.core.protocol import Motion, load_protocol, motion_problems
 from service.rig import load_rig
 from service.run_start import require_runnable
 from service.station import devices_of

@@ -10,7 +10,7 @@ import pytest
 
 from service.core.documents import lifecycle_text, schema_text
 from service.core.errors import ProtocolError
-from service.core.protocol.models import load_protocol, protocol_json_schema
+from service.core.protocol import load_protocol, protocol_json_schema
 from tests.support.record.core import KINDS, TOY, CaptureParams, ChecklistParams, load
 
 

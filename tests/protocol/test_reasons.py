@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import ProtocolError
-from service.core.protocol.models import Reasons
-from service.core.records.events import OperatorAction
+from service.core.protocol import Reasons
+from service.core.records.run_events import OperatorAction
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.record.core import TOY, load
 from tests.support.runs.bench_run import PROTOCOL, Bench

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from service.core.checked_yaml import YamlTree, parse_yaml
 from service.core.errors import ProtocolError
-from service.core.text.checked_yaml import YamlTree, parse_yaml
 
 PROTOCOLS = sorted((Path(__file__).parents[2] / "protocols").rglob("*.yaml"))
-LIBRARY = "service.core.text.checked_yaml._library_loader"
+LIBRARY = "service.core.checked_yaml._library_loader"
 # Texts on which the two parsers differ, or did in some version.
 DIFFERENT = (
     *("|#\n", "a: >2#c\n", "{a: mm?}", "[b? c]", "!~ a", "a: !15", "[!<tag:x>, 1]", "a:\tb\n", "%YAML 1.3\n--- a"),

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import ActionAfterEnd, ActionRefused
+from service.core.records.events import ActionAfterEnd
+from service.core.records.run_events import ActionRefused
 from service.store.records import SITE
 from service.store.store import Store
 from service.store.verification.verify import verify

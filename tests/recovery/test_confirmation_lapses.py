@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from drivers.errors import DeviceTimeoutError
-from service.core.records.events import LeaveLapsed, OperatorAction, StepFailed, StepRetried
+from service.core.records.run_events import LeaveLapsed, OperatorAction, StepFailed, StepRetried
 from service.core.run.decide import AskOperator
 from service.core.run.expected import tries_words
 from service.core.run.state import RunState

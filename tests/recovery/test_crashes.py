@@ -10,7 +10,7 @@ import pytest
 from service.computations import board_view, calibrate
 from service.computations.records import Camera
 from service.core.errors import ComputeError
-from service.core.records.events import (
+from service.core.records.run_events import (
     JobEnqueued,
     JobFailed,
     OperatorAction,

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import ArmDepartedError
 from drivers.interfaces import RobotState
-from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
+from service.core.records.run_events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.steps.motion import STANDS_RAD, require_there

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import DeviceBusyError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.interfaces import SafetyState
-from service.core.records.events import (
+from service.core.records.run_events import (
     DeviceOpened,
     DeviceTrouble,
     OperatorAction,

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.errors import DeviceUnavailableError
 from service.core.recorded_devices import RecordedIdentity, exchanged
-from service.core.records.events import DeviceOpened, DeviceTrouble, OperatorAction, StepFailed
+from service.core.records.run_events import DeviceOpened, DeviceTrouble, OperatorAction, StepFailed
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from tests.support.record.core import Log, toy_protocol

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from service.core.records.events import OperatorAction, SessionStarted, StepFailed, StepStarted
+from service.core.records.run_events import OperatorAction, SessionStarted, StepFailed, StepStarted
 from service.core.recovery import recovery_policy
 from service.core.run.decide import AskOperator, Retry, RunStep
 from tests.support.record.core import TOY, Log, captured, toy_protocol

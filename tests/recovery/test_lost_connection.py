@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import (
+from service.core.records.run_events import (
     DeviceOpened,
     DeviceTrouble,
     OperatorAction,

@@ -16,8 +16,8 @@ import pytest
 from service.cli.operators import AutomaticOperator, Display, SimulatedHands
 from service.cli.terminal_output import Terminal
 from service.core.errors import OrthocaptureError
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import OperatorAction, StepNote
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import OperatorAction, StepNote
 from service.core.run.state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import load_rig

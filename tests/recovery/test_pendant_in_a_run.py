@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.arms.model import arm_model, flange_pose, pose_gap
-from service.core.records.events import ViewpointCaptured
+from service.core.arms import arm_model, flange_pose, pose_gap
+from service.core.records.run_events import ViewpointCaptured
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.arms.arm_watch import ArmWatch

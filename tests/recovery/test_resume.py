@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from service.core.errors import OrthocaptureError
-from service.core.records.events import SessionStarted, ViewpointCaptured
+from service.core.records.run_events import SessionStarted, ViewpointCaptured
 from service.store.database.opening import has_database
 from service.store.store import Store
 from tests.support.arms.arm_watch import watched_arm

@@ -15,7 +15,7 @@ import pytest
 
 from service.cli.exit_status import ExitStatus
 from service.cli.run import end_with_children
-from service.core.records.events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
+from service.core.records.run_events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
 from tests.recovery.test_resume import captured, recorded, short_protocol, wait_for, wait_for_captures
 from tests.support.processes.below import processes_below
 from tests.support.processes.waiting import until

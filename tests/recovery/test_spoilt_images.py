@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import pytest
 import yaml
 
-from service.core.records.events import OperatorAction, StepNote, StepRetried, ViewpointCaptured
+from service.core.records.run_events import OperatorAction, StepNote, StepRetried, ViewpointCaptured
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.run_start import recorded_run

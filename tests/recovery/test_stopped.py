@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.core.protocol.models import Protocol
-from service.core.records.events import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
+from service.core.protocol import Protocol
+from service.core.records.run_events import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
 from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.web.page.run_frame import needs, stopped_words
 from tests.support.pages.browsed_run import words

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import DeviceTrouble, OperatorAction
+from service.core.records.run_events import DeviceTrouble, OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.store.store import Store

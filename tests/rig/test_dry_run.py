@@ -12,7 +12,7 @@ import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.rig import load_rig
 from service.store.store import Store
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig

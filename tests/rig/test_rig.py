@@ -20,7 +20,7 @@ import pytest
 import trimesh
 import yaml
 
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.core.disk_space import LEAST_FREE_BYTES, Usage, forecast
 from service.core.errors import SpaceShortError
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import OperatorAction, StepFailed, StepNote
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.run_events import OperatorAction, StepFailed, StepNote
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.rig import load_rig

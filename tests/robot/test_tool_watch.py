@@ -12,7 +12,7 @@ from drivers.arm.latch import Latch
 from drivers.errors import ToolChangedError
 from drivers.interfaces import Array, Payload, Transform
 from drivers.ur.tool import JUMP_M, JUMP_RAD, ToolWatch, jumped
-from service.core.arms.model import FITS_M, FITS_RAD, ArmModel, arm_model, fits, flange_pose, pose_gap
+from service.core.arms import FITS_M, FITS_RAD, ArmModel, arm_model, fits, flange_pose, pose_gap
 from service.core.geometry import transform
 from tests.support.arms.ur_driver import PAYLOAD, T_FLANGE_TCP
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.interfaces import answers_of
 from drivers.ur.primary import ControllerKinematics, calibration_of, take_kinematics
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.primary import kinematics_message
 from tests.support.arms.ur_driver import SPEED_UP, opened

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import StepNote
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.run_events import StepNote
 from service.runner.held_run import held_run
 from service.runner.upkeep import Seal
 from service.steps import params_models

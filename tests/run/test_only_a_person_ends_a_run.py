@@ -14,7 +14,7 @@ from drivers.errors import (
     MachineBusyError,
 )
 from service.core.errors import OrthocaptureError
-from service.core.records.events import LeaveLapsed, OperatorAction, RunAborted, StepFailed, StepNote, StepStarted
+from service.core.records.run_events import LeaveLapsed, OperatorAction, RunAborted, StepFailed, StepNote, StepStarted
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.store.durable_effects import DurableFiles

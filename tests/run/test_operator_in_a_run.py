@@ -6,12 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.interfaces import SafetyState
-from service.core.records.events import (
-    ActionRefused,
-    OperatorAction,
-    StepNote,
-    ViewpointCaptured,
-)
+from service.core.records.run_events import ActionRefused, OperatorAction, StepNote, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing

@@ -23,7 +23,8 @@ from service.audit.runs.search import find_runs
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
 from service.core.records.entered import NoteTaken, RunAbout
-from service.core.records.events import PAYLOAD, RunAborted, RunStarted
+from service.core.records.events import PAYLOAD
+from service.core.records.run_events import RunAborted, RunStarted
 from service.store.signatures.signing import checkpoint
 from service.store.verification.verify import verify
 from tests.support.pages.browsed_run import words

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import IntegrityError
-from service.core.records.events import StepNote, StepPassed
+from service.core.records.run_events import StepNote, StepPassed
 from service.followed_run import RunFollower
 from service.run_start import recorded_run
 from tests.support.pages.web import WebSite, web_site

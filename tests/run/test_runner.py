@@ -8,11 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import ConfigurationError, StoreError
-from service.core.records.events import (
-    DeviceOpened,
-    SessionStarted,
-    ViewpointCaptured,
-)
+from service.core.records.run_events import DeviceOpened, SessionStarted, ViewpointCaptured
 from service.run_start import recorded_rig, recorded_run
 from service.store.journal.rebuild import rebuild
 from service.store.records import Checkpoint, LeaseHeldError, RecordDamagedError

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.core.protocol.models import Protocol, load_protocol
-from service.core.records.events import ItemTicked, OperatorAction
+from service.core.protocol import Protocol, load_protocol
+from service.core.records.run_events import ItemTicked, OperatorAction
 from service.core.run.decide import record_to_sign
 from service.core.run.fold import fold
 from service.core.run.state import RunState

@@ -14,9 +14,9 @@ from service.cli.main import app
 from service.cli.operators import AutomaticOperator, Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.core.errors import PersonNeededError
-from service.core.records.events import OperatorAction, StepFailed
+from service.core.records.entered import REASON_CHARACTERS
+from service.core.records.run_events import OperatorAction, StepFailed
 from service.core.run.decide import AskOperator
-from service.core.text.words import REASON_CHARACTERS
 from service.monitor.reporter import OpenDevices, Reporter
 from service.store.store import Store
 from tests.support.record.core import Log, toy_protocol

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.core.records.events import OperatorAction, StepNote
+from service.core.records.run_events import OperatorAction, StepNote
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.run_start import recorded_run

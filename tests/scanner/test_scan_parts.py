@@ -18,7 +18,7 @@ from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.compute.surfaces.constellations import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
-from service.core.records.events import StepFailed
+from service.core.records.run_events import StepFailed
 from tests.support.runs.bench_run import begin_run, bench_store, say
 from tests.support.runs.computing_run import OneScanner, begin_computing_run
 

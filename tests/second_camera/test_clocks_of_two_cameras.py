@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from service.core.clocks import clock_offset, clock_readings
-from service.core.records.events import ArtefactRef, DeviceOpened, FurtherExposure, ViewpointCaptured
+from service.core.recorded_devices import clock_offset, clock_readings
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import DeviceOpened, FurtherExposure, ViewpointCaptured
 from service.store.records import NewArtefact
 from service.store.store import Store
 from tests.support.record.stepped_clock import SteppedClock

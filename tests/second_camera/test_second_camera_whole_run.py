@@ -21,7 +21,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.camera_files import read_camera_json
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
-from service.core.records.events import JobFinished, ViewpointCaptured
+from service.core.records.run_events import JobFinished, ViewpointCaptured
 from service.dataset.summary import summarise
 from service.run_start import recorded_run
 from service.store.store import Store

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DeviceUnavailableError
-from service.core.records.events import FurtherExposure, ViewpointCaptured, ViewpointFailed
+from service.core.records.run_events import FurtherExposure, ViewpointCaptured, ViewpointFailed
 from service.rig import FurtherCameraSection
 from service.steps.context import FurtherCamera
 from tests.support.rig.bench_rig import BenchCamera

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.core.records.events import GatesEvaluated, StepMeasured, StepNote, StepRetried
+from service.core.records.run_events import GatesEvaluated, StepMeasured, StepNote, StepRetried
 from tests.support.boards.board_bench import MOUNT, PROTOCOL, Picture, board_room
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import Bench, begin_run, bench_store

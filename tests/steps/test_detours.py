@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.core.geometry import Array
-from service.core.records.events import OperatorAction, ViewpointFailed
+from service.core.records.run_events import OperatorAction, ViewpointFailed
 from service.steps import motion
 from service.steps.kinds import viewpoint_capture
 from service.steps.viewpoints import Viewpoint, flange_target

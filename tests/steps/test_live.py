@@ -27,9 +27,9 @@ from service.compute.planning.coverage import (
     CoverageLimits,
 )
 from service.compute.registration.hypotheses import paired
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from service.core.geometry import Array, apply, inverse, transform
-from service.core.records.events import GatesEvaluated, StepNote
+from service.core.records.run_events import GatesEvaluated, StepNote
 from service.store.store import Store
 from service.worker.loop import HANDLERS, work
 from tests.support.rig.bench_rig import answer, other_settings

@@ -36,9 +36,9 @@ from service.compute.planning.motion_plan import (
     shortest_order,
     travel_times_s,
 )
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from service.core.geometry import Array, Transform, inverse, look_at, transform
-from service.core.protocol.models import Motion, load_protocol
+from service.core.protocol import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models

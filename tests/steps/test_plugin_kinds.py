@@ -17,7 +17,7 @@ PLUGIN = '''
 
 from typing import Annotated
 
-from service.core.protocol.step_params import StepParams
+from service.core.step_params import StepParams
 from service.core.records.base import Record
 from service.computations.kind import JobKind, JobRecord
 from service.steps.context import Announcement, JobRequest, StepKind, StepOutcome

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from drivers.interfaces import CameraSettings
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.steps import motion
 from service.steps.kinds import viewpoint_capture
 from service.steps.viewpoints import Viewpoint

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.records.events import DataRestored, ViewpointCaptured
+from service.core.records.events import DataRestored
+from service.core.records.run_events import ViewpointCaptured
 from service.store.backup.backup import BackupOptions, back_up
 from service.store.backup.folder import BackupFolder
 from service.store.backup.restore import restore

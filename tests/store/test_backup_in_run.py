@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import ViewpointCaptured
+from service.core.records.run_events import ViewpointCaptured
 from service.store.store import Store
 from tests.support.processes.started import started
 from tests.support.processes.waiting import until

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.database.changes import Channel, HeardChanges, PolledChanges
 from service.store.records import NewJob
 from service.store.store import Store

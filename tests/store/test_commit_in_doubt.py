@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import StoreError
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify

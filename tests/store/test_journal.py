@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.records.events import OperatorAction, RecordRebuilt
+from service.core.records.events import RecordRebuilt
+from service.core.records.run_events import OperatorAction
 from service.store.database.engine import DATABASE_NAME, database_path
 from service.store.database.tables import metadata
 from service.store.durable_effects import DurableFiles, SystemClock

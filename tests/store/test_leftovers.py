@@ -14,7 +14,9 @@ import pytest
 from psutil import boot_time
 from sqlalchemy import update
 
-from service.core.records.events import ArtefactRef, LeftoversRemoved, SessionStarted
+from service.core.records.base import ArtefactRef
+from service.core.records.events import LeftoversRemoved
+from service.core.records.run_events import SessionStarted
 from service.store.database.tables import leases
 from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from service.core.records.events import DeviceTrouble, JobFinished, Payload, StepNote, ViewpointFailed
+from service.core.records.events import Payload
+from service.core.records.run_events import DeviceTrouble, JobFinished, StepNote, ViewpointFailed
 from service.store.store import tell
 from tests.support.record.core import Log
 

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.records.events import RunMoved, RunReceived, StepNote
+from service.core.records.events import RunMoved, RunReceived
+from service.core.records.run_events import StepNote
 from service.store.database.tables import artefacts, event_facets, events
 from service.store.records import SITE, NewJob
 from service.store.signatures.signing import checkpoint

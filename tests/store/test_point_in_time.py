@@ -15,7 +15,7 @@ import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.arms.model import arm_model, flange_pose
+from service.core.arms import arm_model, flange_pose
 from service.core.geometry import Transform, transform
-from service.core.records.events import DeviceOpened
+from service.core.records.run_events import DeviceOpened
 from service.store.records import NewArtefact
 from service.store.store import Store
 from service.store.verification.verify import AuditReport, verify

@@ -20,7 +20,8 @@ from service.audit.record.rows import runs as listed_runs
 from service.audit.record.search import events_page
 from service.cli.main import app
 from service.core.errors import ComputeError, StoreError
-from service.core.records.events import RecordCopied, StepNote
+from service.core.records.events import RecordCopied
+from service.core.records.run_events import StepNote
 from service.store.database.postgres_schema import EVIDENCE
 from service.store.database.tables import artefacts, event_facets, events, jobs, metadata
 from service.store.durable_effects import Clock

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.database.revisions import REVISIONS
 from service.store.records import StoreVersionError
 from service.store.signatures.signing import checkpoint

@@ -8,7 +8,7 @@ import pytest
 
 from service.core.errors import IntegrityError
 from service.core.jobs import Each, Reference, references_in, resolve
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.core.run.state import JobState
 
 ANSWER = {"spheres": [{"at": [1.0, 2.0]}, {"at": [3.0, 4.0]}], "camera": {"fx": 5}}

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from service.audit.bundle.export import export_bundle
 from service.cli.main import app
 from service.computations.job import JobAnswer, JobContext
-from service.core.records.events import JobFailed, StepNote
-from service.core.shown_text import storable, storable_data
+from service.core.records.run_events import JobFailed, StepNote
+from service.core.words import storable, storable_data
 from service.store import events as event_module
 from service.store.records import NewJob
 from service.store.store import Store

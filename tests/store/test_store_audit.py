@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from service.cli.audit import audit_app
 from service.core.errors import OrthocaptureError, StoreError
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.database.engine import database_path
 from service.store.durable_effects import utc_text
 from service.store.events import event_sha256

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from sqlalchemy import create_engine, text
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import ActionRefused, JobEnqueued, StepNote
+from service.core.records.run_events import ActionRefused, JobEnqueued, StepNote
 from service.store.database import engine as database
 from service.store.database import new_schema, revisions
 from service.store.database.engine import database_path

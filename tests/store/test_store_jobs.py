@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import DataError, StoreError
-from service.core.records.events import JobFailed, JobFinished, StepNote
+from service.core.records.run_events import JobFailed, JobFinished, StepNote
 from service.store.durable_effects import SystemClock
 from service.store.records import LeaseHeldError, LeaseLostError, NewArtefact, NewJob
 from service.store.runs import ProcessIdentity, RunLease

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import SignerNamed, StepNote
+from service.core.records.events import SignerNamed
+from service.core.records.run_events import StepNote
 from service.rig import load_rig
 from service.run_start import require_rig_free
 from service.store.records import SITE, NewJob, SignsElsewhereError

@@ -21,8 +21,8 @@ from service.cli.main import app
 from service.cli.operators import Display
 from service.cli.terminal_output import Terminal, bar_of_counts, bar_of_shares, listed, styled
 from service.core.errors import ConfigurationError
-from service.core.records.events import DeviceTrouble, OperatorAction, StepNote
-from service.core.shown_text import shown
+from service.core.records.run_events import DeviceTrouble, OperatorAction, StepNote
+from service.core.words import shown
 from service.logs.terminal import EscapingFormatter
 from service.store.database.tables import metadata
 from service.store.records import NewArtefact, NewJob

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.dataset.summary import summarise
 from service.run_start import recorded_run
 from service.steps import params_models

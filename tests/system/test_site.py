@@ -17,7 +17,7 @@ import httpx
 import pytest
 import yaml
 
-from service.core.records.events import (
+from service.core.records.run_events import (
     JobFinished,
     RunCompleted,
     SessionStarted,

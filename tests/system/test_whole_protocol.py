@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import OperatorAction
+from service.core.records.run_events import OperatorAction
 from tests.support.protocols.shortened import shortened
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
 from tests.support.runs.ended_run import EndedRun, ended_run

@@ -61,7 +61,7 @@ def tree(folder: Path, module: str = MODULE) -> Path:
     return folder
 
 
-GATES = "service/core/gates/made_up.py"
+GATES = "service/core/gates.py"
 
 
 def changes(folder: Path) -> dict[str, set[tuple[str, str]]]:
@@ -122,7 +122,7 @@ def recorded(folder: Path, text: str) -> Reach:
     return Reach(folder)
 
 
-TEST = "from service.core.gates.made_up import judge\n\ndef test_limit() -> None:\n    assert judge(5.0)\n"
+TEST = "from service.core.gates import judge\n\ndef test_limit() -> None:\n    assert judge(5.0)\n"
 
 
 def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whole(tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whol
         ["tests/core/test_gate.py::test_limit"]
     ]
     assert reach.selected("gates", GATES, noted) == []
-    rules = "service/core/protocol/rules.py"  # has no function, so that no test is known to reach it
+    rules = "service/core/protocol.py"  # has no function, so that no test is known to reach it
     assert [one.tests for one in reach.selected("gates", rules, 3)] == [("test_limit",)]
     (whole,) = reach.selected("gates", GATES, 8)  # a constant: whatever reaches the file
     assert whole.tests == ("test_limit",)

@@ -17,7 +17,7 @@ from service.audit.bundle.export import bundle_report, export_bundle
 from service.audit.verify import bundle_verifier
 from service.cli.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
-from service.core.records.events import EvidenceExported, RunReleased, StepNote
+from service.core.records.run_events import EvidenceExported, RunReleased, StepNote
 from service.store.artefacts import hash_file
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -14,9 +14,9 @@ from service.audit.bundle.contents import read_bundled_run, write_artefacts, wri
 from service.audit.bundle.crate import crate_json
 from service.audit.bundle.export import FORMAT, MANIFEST_PREFIX
 from service.audit.verify import bundle_verifier
-from service.core.arms.model import arm_model, flange_pose, known_arms
+from service.core.arms import arm_model, flange_pose, known_arms
 from service.core.geometry import transform
-from service.core.records.events import DeviceOpened
+from service.core.records.run_events import DeviceOpened
 from service.dataset.crate import METADATA
 from service.run_start import recorded_run
 from service.store.events import canonical

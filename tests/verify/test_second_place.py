@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import DeviceTrouble, SignInRecorded
+from service.core.records.events import SignInRecorded
+from service.core.records.run_events import DeviceTrouble
 from service.store.durable_effects import DurableFiles
 from service.store.records import SITE
 from service.store.signatures.log import NAME

@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import SignInRecorded, StepPassed, StepStarted
+from service.core.records.events import SignInRecorded
+from service.core.records.run_events import StepPassed, StepStarted
 from service.rig import load_rig
 from service.run_start import second_place, signature_copy
 from service.store.database.engine import database_path

@@ -10,7 +10,8 @@ import pytest
 from service.audit.record import starts
 from service.audit.record.starts import record_start
 from service.core.errors import ConfigurationError
-from service.core.records.events import RunAborted, ServiceStarted
+from service.core.records.events import ServiceStarted
+from service.core.records.run_events import RunAborted
 from service.rig import Rig, load_rig
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import StoreError
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.people.credentials import token_sha256
 from service.people.person import LinkError, NotSignedInError, Person, PinRefusedError, SignInRefusedError
 from service.people.sessions import People

@@ -12,7 +12,7 @@ from rfc3161_client import HashAlgorithm, TimestampRequestBuilder
 
 from service.audit.bundle.export import export_bundle
 from service.audit.verify import bundle_verifier
-from service.core.records.events import DeviceTrouble
+from service.core.records.run_events import DeviceTrouble
 from service.rig import load_rig
 from service.run_start import time_stamp_authority as time_stamp_authority_of
 from service.store.records import TimestampError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.protocol.models import load_protocol
+from service.core.protocol import load_protocol
 from service.steps import params_models
 from tests.support.pages.browsed_run import words as page_words
 from tests.support.pages.web import Browser, web_site

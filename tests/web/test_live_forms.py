@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import ActionRefused, OperatorAction, SessionStarted
+from service.core.records.run_events import ActionRefused, OperatorAction, SessionStarted
 from tests.support.pages.browsed_run import BrowsedRun
 from tests.support.pages.forms import PageForm, forms_of
 from tests.support.pages.states import STATES, Seen, asked_for_control, by_hand, capturing, looking_on, submit

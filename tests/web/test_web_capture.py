@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from service.core.geometry import apply, inverse, look_at
-from service.core.records.events import StepNote, ViewpointFailed
+from service.core.records.run_events import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, scene_json, viewing_frame
 from service.steps.context import StationLayout
 from service.web.calibration.boards import empty_regions

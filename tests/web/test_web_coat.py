@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import OperatorAction
+from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.web.run import pages

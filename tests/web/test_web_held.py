@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
 from service.cli.main import app
-from service.core.records.events import CaptureAsked, DeviceOpened
+from service.core.records.run_events import CaptureAsked, DeviceOpened
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, password_of, web_site
 from tests.support.runs.bench_run import Bench

@@ -15,7 +15,7 @@ import pytest
 
 from service.core.errors import DataError
 from service.core.picture_files import picture_size
-from service.core.records.events import FilesKept
+from service.core.records.run_events import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
 from service.web.record.pictures import DrawnOutline, cached, draw_marks, nearest_width, reduced_jpeg, safe_name

@@ -9,13 +9,8 @@ from pathlib import Path
 import pytest
 
 from service.audit.record.run import read_run
-from service.core.records.events import (
-    OperatorAction,
-    Payload,
-    StepFailed,
-    StepStarted,
-    ViewpointFailed,
-)
+from service.core.records.events import Payload
+from service.core.records.run_events import OperatorAction, StepFailed, StepStarted, ViewpointFailed
 from tests.support.pages.browsed_run import BrowsedRun, words
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until

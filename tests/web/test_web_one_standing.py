@@ -9,7 +9,7 @@ from html import unescape
 
 import pytest
 
-from service.core.records.events import DeviceOpened, DeviceTrouble, FilesKept, OperatorAction, RecordedView
+from service.core.records.run_events import DeviceOpened, DeviceTrouble, FilesKept, OperatorAction, RecordedView
 from service.core.recovery import ways_on
 from service.monitor.snapshot import RobotPhase, Snapshot, write_snapshot
 from service.people.person import ROLES, Role, may

@@ -15,7 +15,7 @@ import pytest
 
 from service.computations import fuse
 from service.core.geometry import apply
-from service.core.records.events import RegionDrawn
+from service.core.records.run_events import RegionDrawn
 from service.core.run.fold import fold
 from service.core.run.state import JobState
 from service.dataset.scene_view import scene_json, viewing_frame

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import OperatorAction, RunAborted
+from service.core.records.run_events import OperatorAction, RunAborted
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.records import SITE
 from tests.support.pages.web import Browser, WebSite, web_site

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import (
+from service.core.records.run_events import (
     DeviceOpened,
     DeviceTrouble,
     ItemTicked,

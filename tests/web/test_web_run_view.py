@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import quantity
-from service.core.protocol.models import Protocol, load_protocol
-from service.core.records.events import (
-    ArtefactRef,
+from service.core.gates import quantity
+from service.core.measure_names import measure_name
+from service.core.protocol import Protocol, load_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import (
     DeviceOpened,
     DeviceTrouble,
     FilesKept,
@@ -32,7 +32,7 @@ from service.core.recovery import planned_views
 from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.core.run.expected import duration, tries_words
 from service.core.run.fold import fold
-from service.core.text.words import time_here
+from service.core.words import time_here
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
 from service.web.page.robot_banner import robot_banner

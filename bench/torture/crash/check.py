@@ -14,8 +14,9 @@ from typing import Any
 from bench.torture.crash.confirmed import confirmed
 from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
-from service.core.protocol.models import Protocol
-from service.core.records.events import Event, JobFinished, RecordedView, StepMeasured
+from service.core.protocol import Protocol
+from service.core.records.events import Event
+from service.core.records.run_events import JobFinished, RecordedView, StepMeasured
 from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.database.engine import database_path

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.core.protocol.models import Protocol
-from service.core.records.events import Event, OperatorAction, SessionStarted
+from service.core.protocol import Protocol
+from service.core.records.events import Event
+from service.core.records.run_events import OperatorAction, SessionStarted
 
 
 def confirmed(events: Sequence[Event], protocol: Protocol, monotonic_s: float) -> bool:

@@ -24,8 +24,9 @@ import psutil
 import yaml
 
 from bench.torture.crash.confirmed import confirmed
-from service.core.protocol.models import Protocol, load_protocol
-from service.core.records.events import Event, OperatorAction, SessionStarted, ViewpointCaptured
+from service.core.protocol import Protocol, load_protocol
+from service.core.records.events import Event
+from service.core.records.run_events import OperatorAction, SessionStarted, ViewpointCaptured
 from service.core.run.actions import refuse
 from service.core.run.decide import AskOperator, decide
 from service.core.run.fold import fold

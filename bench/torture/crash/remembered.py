@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from service.computations.job import ArtefactStore, Handler, JobAnswer, RecordedContext
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.store.events import canonical
 
 

@@ -15,10 +15,9 @@ import numpy as np
 
 from bench.torture.crash.remembered import remembering
 from bench.torture.crash.scene import CAMERA, LAYOUT, VIEWPOINTS, CrashRig, prepare_files
-from service.core.gates.release import refuse_release
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import RunReleased, StepMeasured, StepStarted
+from service.core.gates import evaluate_gates, refuse_release
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import RunReleased, StepMeasured, StepStarted
 from service.core.run.fold import fold
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run

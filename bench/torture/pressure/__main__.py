@@ -33,13 +33,7 @@ from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.torture.pressure.groups import Group, Limits, group
 from service.core.errors import OrthocaptureError
 from service.core.records.base import seconds_between
-from service.core.records.events import (
-    DeviceTrouble,
-    StepFailed,
-    StepPassed,
-    StepStarted,
-    ViewpointCaptured,
-)
+from service.core.records.run_events import DeviceTrouble, StepFailed, StepPassed, StepStarted, ViewpointCaptured
 from service.core.run.decide import AskOperator, decide, fold
 from service.run_start import recorded_run
 from service.store.store import Store

@@ -6,7 +6,7 @@ from functools import cache
 
 from drivers.errors import DeviceRefusedError
 from drivers.gphoto.profile import Profile
-from service.core.declared_kinds import plug_ins
+from service.core.loading import plug_ins
 
 GROUP = "orthocapture.camera_profiles"
 

@@ -18,10 +18,9 @@ from sqlalchemy import Connection, Table, select
 
 from service.audit.record.run import not_in_yet
 from service.core.errors import DataError, IntegrityError, StoreError
-from service.core.protocol.models import Protocol
-from service.core.records.events import RunStarted
-from service.core.run.fold import fold
-from service.core.run.folded import FoldedRun
+from service.core.protocol import Protocol
+from service.core.records.run_events import RunStarted
+from service.core.run.fold import FoldedRun, fold
 from service.people.rows import full_names
 from service.store.artefacts import chunks_of, read_artefacts
 from service.store.database.tables import artefacts as artefact_table

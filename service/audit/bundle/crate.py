@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from service.audit.bundle.contents import BundledRun, ManifestEntry
-from service.core.gates.acceptance import describe_accepted
+from service.core.gates import describe_accepted
 from service.core.recorded_devices import bodies, recorded_report
-from service.core.records.events import (
-    ArtefactRef,
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Event
+from service.core.records.import_list import imported_sentence
+from service.core.records.run_events import (
     DeviceOpened,
-    Event,
     JobEnqueued,
     JobFinished,
     RunStarted,
@@ -19,7 +20,6 @@ from service.core.records.events import (
     ViewImported,
     ViewpointCaptured,
 )
-from service.core.records.import_list import imported_sentence
 from service.dataset.crate import CONTEXT, anchor, descriptor, device, file_entity, person, software
 from service.store.events import canonical, references
 from service.store.records import Artefact

@@ -23,9 +23,9 @@ from service.audit.bundle.contents import (
 )
 from service.audit.bundle.crate import crate_json
 from service.core.errors import IntegrityError
-from service.core.gates.release import refuse_export
-from service.core.protocol.models import Protocol
-from service.core.records.events import EvidenceExported, RunStarted
+from service.core.gates import refuse_export
+from service.core.protocol import Protocol
+from service.core.records.run_events import EvidenceExported, RunStarted
 from service.core.run.fold import fold
 from service.dataset.crate import METADATA
 from service.run_start import recorded_run

@@ -26,7 +26,8 @@ from service.audit.export.wanted import (
     unfinished_exports,
 )
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
-from service.core.records.events import Event, EvidenceExported
+from service.core.records.events import Event
+from service.core.records.run_events import EvidenceExported
 from service.dataset.export_folder import SUMS
 from service.store.durable_effects import Clock, utc_text
 

@@ -11,7 +11,7 @@ from service.audit.bundle.export import record_export, require_exportable
 from service.audit.export.wanted import WantedExport
 from service.audit.record.run import not_in_yet, read_run
 from service.core.errors import ConfigurationError
-from service.core.gates.release import refuse_data_set
+from service.core.gates import refuse_data_set
 from service.core.records.data_set import VERSION
 from service.dataset.exporter import Exporter, exporter, write_data_set
 from service.dataset.pixels import cropped_data_set, undistorted_data_set

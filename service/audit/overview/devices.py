@@ -9,7 +9,7 @@ from sqlalchemy import Connection, text
 
 from service.audit.record.rows import EventRow, plain, read_rows
 from service.core.recorded_devices import CameraBodies, RecordedReport, bodies_of, recorded_report
-from service.core.records.events import DeviceOpened, SessionStarted, ViewpointCaptured
+from service.core.records.run_events import DeviceOpened, SessionStarted, ViewpointCaptured
 
 _LOOKED_AT = 500  # newest photographs; one that states another body is judged as a departing image anyway
 

@@ -15,19 +15,12 @@ from service.audit.record.rows import head, plain, root
 from service.audit.record.search import Facets
 from service.computations import evaluate
 from service.core.errors import IntegrityError, OrthocaptureError
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import (
-    PAYLOAD,
-    Event,
-    GatesEvaluated,
-    GateVerdict,
-    Payload,
-    RecordedView,
-    ViewpointFailed,
-)
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.events import PAYLOAD, Event, Payload
+from service.core.records.run_events import GatesEvaluated, GateVerdict, RecordedView, ViewpointFailed
 from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_state
 from service.core.run.state import Deviation, RunState
-from service.core.text.words import counted
+from service.core.words import counted
 from service.dataset.registrations import LateResult, late_results
 from service.store.store import Store
 

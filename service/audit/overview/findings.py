@@ -14,10 +14,11 @@ from sqlalchemy import Connection, text
 from service.audit.overview.digest import Digest
 from service.audit.record.rows import EventRow, one_event, plain, read_rows, seqs_of_kind
 from service.core.errors import DataError
-from service.core.gates.verdict import quantity, uncertain
-from service.core.records.events import Event, RecordCorrected, Uncertainty
-from service.core.text.files import parse_json
-from service.core.text.words import reason_of
+from service.core.gates import quantity, uncertain
+from service.core.records.entered import reason_of
+from service.core.records.events import Event
+from service.core.records.run_events import RecordCorrected, Uncertainty
+from service.core.text_files import parse_json
 from service.store.store import Store
 
 

@@ -10,7 +10,7 @@ from service.audit.filters import RunFilter
 from service.audit.overview.digest import Digest, FailedGate
 from service.audit.record.rows import RunBasics
 from service.audit.verify.verifications import Verification
-from service.core.gates.verdict import describe_judged
+from service.core.gates import describe_judged
 from service.core.run.state import DeviationKind
 
 # Group on the page → its name in the plural, and the kinds of deviations in it; a group without any lists none.

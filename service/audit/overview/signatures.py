@@ -10,7 +10,7 @@ from service.audit.overview.digest import Digest
 from service.audit.overview.findings import LISTED
 from service.audit.record.rows import EventRow, computed_sha256, plain, read_rows, seq_of_hash
 from service.core.errors import StoreError
-from service.core.records.events import OperatorAction, RunReleased
+from service.core.records.run_events import OperatorAction, RunReleased
 
 
 @dataclass(frozen=True, slots=True)

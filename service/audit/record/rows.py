@@ -14,7 +14,7 @@ from sqlalchemy import Connection, bindparam, text
 from service.core.errors import IntegrityError
 from service.core.records.base import Record
 from service.core.records.entered import RunAbout
-from service.core.records.events import RunStarted
+from service.core.records.run_events import RunStarted
 from service.store.events import event_sha256, parse_canonical
 from service.store.records import SITE, UnknownRunError
 from service.store.verification.chain_checks import summary

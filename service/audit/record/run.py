@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.core.errors import IntegrityError
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import Event, RunStarted
-from service.core.run.fold import fold
-from service.core.run.folded import FoldedRun
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.events import Event
+from service.core.records.run_events import RunStarted
+from service.core.run.fold import FoldedRun, fold
 from service.core.run.state import RunState
 from service.people.rows import full_names, named
 from service.steps import params_models

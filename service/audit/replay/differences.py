@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from service.core.geometry import Array
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 
 # Relative to the largest number of a field: rounding that differs between processors and libraries. Predicted errors
 # differ by 1e-8 between processors with and without AVX-512, which is 3e-9 mm of 0.3 mm.

@@ -18,7 +18,8 @@ from service.computations.job import JobAnswer
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.jobs import Reference, computed_by, jobs_of, resolve
-from service.core.records.events import ArtefactRef, JobFinished
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import JobFinished
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary

@@ -17,9 +17,10 @@ from service.audit.replay.recomputed import Drift, RecomputedJobs, ScratchStore,
 from service.computations import job_kinds
 from service.computations.job import JobAnswer, JobContext
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
-from service.core.gates.verdict import evaluate_gates
+from service.core.gates import evaluate_gates
 from service.core.jobs import jobs_of, resolve
-from service.core.records.events import ArtefactRef, GateVerdict, JobEnqueued, JobFinished, SessionStarted
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import GateVerdict, JobEnqueued, JobFinished, SessionStarted
 from service.core.run.state import JobState
 from service.runner.software import software_versions
 from service.store.events import parse_canonical, payload_text

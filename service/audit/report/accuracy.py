@@ -21,8 +21,8 @@ from service.audit.report.blocks import (
     words,
 )
 from service.computations.evaluate import ErrorBudget, Row
-from service.core.gates.acceptance import depends_on
-from service.core.text.words import counted
+from service.core.gates import depends_on
+from service.core.words import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 from service.dataset.registrations import late_results, shared_adjustment_note
 from service.dataset.summary import RunSummary

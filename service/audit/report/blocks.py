@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from typing import ClassVar, Literal
 
 from service.computations import term
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import Standing, figure, limits, standing
-from service.core.records.events import GateVerdict
+from service.core.gates import Standing, figure, limits, standing
+from service.core.measure_names import measure_name
+from service.core.records.run_events import GateVerdict
 
 Tone = Literal["plain", "ok", "attention", "stop"]
 Style = Literal["text", "number", "code"]

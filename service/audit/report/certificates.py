@@ -38,10 +38,9 @@ from service.computations.calibrate.records import (
     Residuals,
 )
 from service.computations.records import Camera
-from service.core.gates.acceptance import depends_on
+from service.core.gates import depends_on
 from service.core.geometry import Array
-from service.core.records.events import RecordedView
-from service.core.records.optics import RecordedOptics
+from service.core.records.run_events import RecordedOptics, RecordedView
 from service.core.units import mm
 
 _WIDTH = 480.0

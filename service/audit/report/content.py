@@ -27,9 +27,9 @@ from service.audit.report.course import (
 from service.audit.report.origin import devices_section, software_section, verification_section
 from service.audit.report.photographs import about_facts, notes_section, pictures_section
 from service.core.errors import OrthocaptureError
-from service.core.records.events import SessionStarted
 from service.core.records.import_list import imported_sentence
-from service.core.text.words import counted
+from service.core.records.run_events import SessionStarted
+from service.core.words import counted
 from service.dataset.registrations import late_results
 from service.rig import parse_recorded_rig
 from service.store.verification.verify import AuditReport

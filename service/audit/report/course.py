@@ -23,8 +23,8 @@ from service.audit.report.blocks import (
     utc,
     words,
 )
-from service.core.gates.verdict import BOUNDS_HOLD, describe_judged
-from service.core.records.events import (
+from service.core.gates import BOUNDS_HOLD, describe_judged
+from service.core.records.run_events import (
     DeviceTrouble,
     GatesEvaluated,
     LeaveLapsed,
@@ -36,7 +36,7 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.state import StepState
-from service.core.text.words import counted
+from service.core.words import counted
 
 
 @dataclass(frozen=True, slots=True)

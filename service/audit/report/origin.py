@@ -19,11 +19,10 @@ from service.audit.report.blocks import (
     clock,
 )
 from service.computations import term
-from service.core.clocks import clock_offset_words, clock_readings
-from service.core.recorded_devices import CameraBodies, bodies, recorded_report
-from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
-from service.core.text.words import counted
+from service.core.recorded_devices import CameraBodies, bodies, clock_offset_words, clock_readings, recorded_report
+from service.core.records.run_events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.core.units import megabytes, ms, um
+from service.core.words import counted
 from service.steps.notes import deidentified
 from service.store.verification.verify import AuditReport
 

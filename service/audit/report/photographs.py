@@ -27,9 +27,9 @@ from service.audit.report.blocks import (
 from service.audit.report.scene import report_scene
 from service.compute.images.photographs import decode_reduced
 from service.core.errors import DataError, IntegrityError
-from service.core.protocol.models import Step
+from service.core.protocol import Step
 from service.core.records.entered import NoteTaken, about_rows
-from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured
+from service.core.records.run_events import FurtherExposure, RecordedView, ViewpointCaptured
 
 THUMBNAIL_PX = 240
 LARGE_PX = 720

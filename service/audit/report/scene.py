@@ -19,8 +19,8 @@ from service.audit.report.blocks import Drawing, Label, Line, Raster, Rectangle,
 from service.compute.evaluation.error_budget import Alignment
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, apply
-from service.core.text.words import counted
 from service.core.units import metres, mm
+from service.core.words import counted
 from service.dataset import scene_view
 from service.dataset.further_cameras import further_poses
 from service.dataset.scene_view import frustum_lines, unit_ball

@@ -12,11 +12,11 @@ import numpy as np
 from service.computations import calibrate
 from service.computations.evaluate import Row
 from service.computations.records import Camera
-from service.core.gates.verdict import figure, limits, quantity, standing
+from service.core.gates import figure, limits, quantity, standing
 from service.core.geometry import Transform
 from service.core.records.entered import ABOUT, RunAbout
-from service.core.records.events import GateVerdict
-from service.core.run.folded import FoldedRun
+from service.core.records.run_events import GateVerdict
+from service.core.run.fold import FoldedRun
 from service.core.run.state import StepState
 from service.core.units import mm
 from service.dataset.registrations import evaluated

@@ -15,7 +15,7 @@ from service.audit.filters import RunSearch
 from service.audit.record.rows import plain_payload
 from service.audit.runs.search import FoundRun, find_runs
 from service.core.recorded_devices import RecordedIdentity, recorded_identity
-from service.core.records.optics import RecordedOptics, recorded_optics
+from service.core.records.run_events import RecordedOptics, recorded_optics
 from service.store.store import Store
 
 InstrumentKind = Literal["camera", "lens", "arm"]

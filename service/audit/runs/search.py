@@ -12,7 +12,7 @@ from sqlalchemy import Connection, text
 
 from service.audit.filters import Result, RunSearch
 from service.audit.record.rows import RunBasics, plain_payload, runs
-from service.core.records.events import GatesEvaluated
+from service.core.records.run_events import GatesEvaluated
 from service.store.runs import read_open_runs
 from service.store.store import Store
 

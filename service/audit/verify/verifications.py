@@ -15,7 +15,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from service.audit.background import ChildProcesses, ChildState, Progress, report
-from service.core.records.events import Record
+from service.core.records.base import Record
 from service.store.durable_effects import Clock, utc_text
 from service.store.verification.chain_checks import Fault
 from service.store.verification.pose_checks import NOT_COMPARED

@@ -45,7 +45,7 @@ from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.core.units import metres, mm
 from service.machine.resources import IMAGE_MB, processes_for
 

@@ -30,9 +30,9 @@ from service.compute.ground_truth.overlap import Box, Prism, RegionCorrection, o
 from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
-from service.core.records.events import ArtefactRef
-from service.core.text.words import SIMULATED
+from service.core.records.base import ArtefactRef
 from service.core.units import deg, metres, mm
+from service.core.words import SIMULATED
 from service.machine.resources import large_arrays_returned
 
 _MM = 1e-3  # metres in the unit of a job's files

@@ -33,7 +33,7 @@ from service.compute.registration.result import RegistrationResult
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef
 from service.core.units import mm
 
 _LEAST_SPHERES = 4

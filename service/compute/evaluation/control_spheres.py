@@ -18,8 +18,8 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse
-from service.core.text.words import counted
 from service.core.units import mm
+from service.core.words import counted
 
 LEAST_SHARE = 0.5  # of the outlines of one control sphere that should be seen
 _NEAR_RADII = 1.0  # around a place that the images agree on, where the outlines that lack are searched

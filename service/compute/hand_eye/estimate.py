@@ -55,7 +55,7 @@ from service.compute.hand_eye.uncertainty import (
     size_sigma,
 )
 from service.compute.hand_eye.weighted import Noise
-from service.core.arms.model import ArmModel
+from service.core.arms import ArmModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 from service.core.units import deg, mm

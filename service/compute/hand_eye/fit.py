@@ -43,7 +43,7 @@ from service.compute.hand_eye.weighted import (
     solve,
     start_at,
 )
-from service.core.arms.model import ArmModel
+from service.core.arms import ArmModel
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform
 

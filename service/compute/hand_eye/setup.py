@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
-from service.core.text.words import counted
 from service.core.units import LENGTH_WORDS, METRES_PER, deg, mm
+from service.core.words import counted
 
 ClosedForm = Literal["park", "daniilidis", "tsai", "horaud", "andreff"]
 

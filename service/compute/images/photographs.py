@@ -25,7 +25,7 @@ from service.core.picture_files import (
     kind_of,
     picture_size,
 )
-from service.core.text.words import counted
+from service.core.words import counted
 
 # Kinds of pictures that nothing here decodes, and files that are no pictures.
 _UNREAD = frozenset({

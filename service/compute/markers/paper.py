@@ -25,7 +25,7 @@ from service.compute.markers.records import (
 from service.compute.markers.rough import find_candidates
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.core.text.files import file_text, parse_json
+from service.core.text_files import file_text, parse_json
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 

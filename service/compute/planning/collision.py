@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from service.compute.arm_kinematics import chain
-from service.core.arms.model import ArmModel
+from service.core.arms import ArmModel
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.units import mm
 

@@ -14,7 +14,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.scene import ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.core.text.files import file_text, parse_json
+from service.core.text_files import file_text, parse_json
 from service.core.units import metres
 
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")

@@ -19,8 +19,7 @@ from service.compute.poses.camera_files import finite_numbers, json_object
 from service.compute.sfm import colmap_process as colmap_files
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
-from service.core.text.delimited_text import TextTable, is_number, read_table
-from service.core.text.files import csv_rows, file_bytes
+from service.core.text_files import TextTable, csv_rows, file_bytes, is_number, read_table
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from service.compute.poses.pose_files import matched_names
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
-from service.core.text.files import csv_rows, file_text, parse_json
-from service.core.text.words import counted
+from service.core.text_files import csv_rows, file_text, parse_json
 from service.core.units import METRES_PER, LengthUnit
+from service.core.words import counted
 
 RotationForm = Literal[
     "quaternion",

@@ -17,8 +17,8 @@ from service.compute.registration.result import RegistrationResult
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
-from service.core.text.words import counted
 from service.core.units import mm
+from service.core.words import counted
 
 ContradictionKind = Literal[
     "image left out", "images contradict", "sphere not found", "spheres not found", "focal length",

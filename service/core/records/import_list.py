@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from service.core.errors import DataError
-from service.core.records.events import Record
-from service.core.records.optics import RecordedOptics, recorded_optics
+from service.core.records.base import Record
+from service.core.records.run_events import RecordedOptics, recorded_optics
 
 PhotographRole = Literal["calibration", "image", "control_image"]
 FileRole = Literal["scan", "control_scan", "ct"]

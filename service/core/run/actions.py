@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from service.core.errors import IllegalTransitionError
-from service.core.gates.acceptance import acceptance_refusal, acceptor_refusal
-from service.core.protocol.models import Protocol, Step
-from service.core.records.events import OperatorAction, OperatorVerb
+from service.core.gates import acceptance_refusal, acceptor_refusal
+from service.core.protocol import Protocol, Step
+from service.core.records.run_events import OperatorAction, OperatorVerb
 from service.core.run.lifecycle import lifecycle, redo
 from service.core.run.state import RunState
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from service.core.errors import IntegrityError
-from service.core.gates.acceptance import describe_accepted
-from service.core.gates.verdict import describe, describe_judged, evaluate_gates
-from service.core.protocol.models import Protocol, Step
-from service.core.records.events import OperatorVerb, Uncertainty
+from service.core.gates import describe, describe_accepted, describe_judged, evaluate_gates
+from service.core.protocol import Protocol, Step
+from service.core.records.run_events import OperatorVerb, Uncertainty
 from service.core.recovery import WayOn, ways_on
 from service.core.run.actions import (
     allowed_actions,
@@ -22,7 +21,7 @@ from service.core.run.actions import (
 )
 from service.core.run.fold import advance, fold, initial_state
 from service.core.run.state import Deviation, JobState, Lapse, Note, RunState, StepState, Superseded, lost_arms
-from service.core.text.words import time_utc
+from service.core.words import time_utc
 
 __all__ = [
     "Accept",

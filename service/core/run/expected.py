@@ -8,11 +8,11 @@ from datetime import datetime, timedelta
 from statistics import median
 
 from service.core.errors import what_of
-from service.core.protocol.models import Protocol, Step
+from service.core.protocol import Protocol, Step
 from service.core.recovery import planned_views, view_s
 from service.core.run.actions import needs_leave
 from service.core.run.state import FailedTries, RunState, StepState
-from service.core.text.words import time_utc
+from service.core.words import time_utc
 
 _TOO_LONG = 1.5  # times what is usual, and longer than ever before
 _SHORT_S = 20.0  # nobody leaves for less

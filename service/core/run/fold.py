@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from service.core.gates.acceptance import describe_accepted, failed_gates
-from service.core.protocol.models import Protocol
+from service.core.errors import IntegrityError
+from service.core.gates import describe_accepted, failed_gates
+from service.core.protocol import Protocol
 from service.core.records.entered import NoteTaken
-from service.core.records.events import (
+from service.core.records.events import Event
+from service.core.records.run_events import (
     ActionRefused,
     CaptureAsked,
     ControlTaken,
     DeviceOpened,
     DeviceTrouble,
-    Event,
     EvidenceExported,
     FilesKept,
     GatesEvaluated,
@@ -76,8 +77,21 @@ from service.core.run.effects import (
     viewpoint_failed,
 )
 from service.core.run.lifecycle import lifecycle, redo
-from service.core.run.state import AcceptedDeviation, DeviationKind, Leave, RunState, StepState
-from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede, wait, wait_no_more
+from service.core.run.state import (
+    UNMEASURED,
+    AcceptedDeviation,
+    DeviationKind,
+    Leave,
+    RunState,
+    StepState,
+    change,
+    deviate,
+    go,
+    pass_on,
+    supersede,
+    wait,
+    wait_no_more,
+)
 
 
 def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return per verb
@@ -281,3 +295,21 @@ def kind_of(payload: type[Any]) -> str:
 
 RUN_EVENTS: Mapping[str, type[Any]] = {kind_of(payload): payload for payload in _HANDLERS}  # every event of a run
 DECISIVE_EVENTS: tuple[str, ...] = tuple(kind_of(payload) for payload in _HANDLERS if payload not in _DETAILS)
+
+
+@dataclass(frozen=True, slots=True)
+class FoldedRun:
+    """The events of one run at one moment and their fold, which belong together."""
+
+    run_id: str
+    protocol: Protocol
+    events: Sequence[Event]
+    state: RunState
+
+    @property
+    def root(self) -> RunStarted:
+        """The run's first event. Raises IntegrityError if it is not run_started."""
+        root = self.events[0].payload if self.events else None
+        if not isinstance(root, RunStarted):
+            raise IntegrityError("the run's first event is not run_started", where=self.run_id)
+        return root

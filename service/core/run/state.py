@@ -1,16 +1,105 @@
-"""The state of a run that its events add up to, as frozen records: RunState and its parts."""
+"""The state of a run that its events add up to, as frozen records: RunState, its parts, their elementary changes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from service.core.records.base import seconds_between
-from service.core.records.events import ArtefactRef, ComputedBy, GateVerdict, Identified, RegionDrawn, Uncertainty
-from service.core.run.lifecycle import Phase
-from service.core.run.noted import MOTION_PLAN, Mending, NotedMotionPlan
-from service.core.text.words import counted
+from pydantic import BaseModel, ConfigDict
+
+from service.core.protocol import Protocol
+from service.core.records.base import ArtefactRef, seconds_between
+from service.core.records.events import Event
+from service.core.records.run_events import ComputedBy, GateVerdict, Identified, RegionDrawn, Uncertainty
+from service.core.run.lifecycle import ABORTED, COMPLETED, Phase, lifecycle
+from service.core.words import counted
+
+MOTION_PLAN = "motion_plan"  # name of the note
+
+
+class _NoteRecord(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class HandWork(_NoteRecord):
+    """The work that a technician should do by hand, for a simulated one; further fields are those of the action."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    action: str  # its name in simulators/rig/world_server.py
+
+
+class Mending(_NoteRecord):
+    """A way to bring an attempt of a step within its limits.
+
+    Attributes:
+        advice: the advice to the technician.
+        title: the request in few words, where it is the normal course of the step and nothing went wrong.
+        does: the effect of the next confirmation in that case, as a button's label; "" where something went wrong.
+        hands: the same for a simulated technician.
+        viewpoints: further views that a retry takes; only their number counts.
+        poses: further poses above the calibration board; only their number counts.
+        images: number of images that a retry takes again.
+    """
+
+    advice: str = ""
+    title: str = ""
+    does: str = ""
+    hands: tuple[HandWork, ...] = ()
+    viewpoints: tuple[object, ...] = ()
+    poses: tuple[object, ...] = ()
+    images: int = 0
+
+
+class NotedView(_NoteRecord):
+    """A viewpoint in a motion plan.
+
+    Attributes:
+        viewpoint: its name.
+        outcome: the planner's answer: feasible, nudged, or refused where the arm cannot take it.
+        reason: the reason of a refusal.
+        nudge_deg: the angle by which it was turned along its arc so that the arm can take it.
+        joints_rad: the arm's joints there; None if refused.
+        travel_s: the travel time from the view before.
+        way_rad: joints of a detour, from those of the view before to the last before this view's; empty if straight.
+    """
+
+    viewpoint: str
+    outcome: str
+    reason: str = ""
+    nudge_deg: float = 0.0
+    joints_rad: tuple[float, ...] | None = None
+    travel_s: float = 0.0
+    way_rad: tuple[tuple[float, ...], ...] = ()
+
+
+class NotedStation(_NoteRecord):
+    """The viewpoints of one station in the order of capture, and how long all of them take."""
+
+    station: str = ""
+    order: str = ""
+    estimated_s: float = 0.0
+    views: tuple[NotedView, ...]
+
+
+class NotedMotionPlan(_NoteRecord):
+    """The arm's motion in a capture."""
+
+    stations: tuple[NotedStation, ...] = ()
+
+    @property
+    def views(self) -> tuple[NotedView, ...]:
+        """All viewpoints in the order of capture."""
+        return tuple(view for station in self.stations for view in station.views)
+
+    @property
+    def view_s(self) -> float | None:
+        """Estimated seconds for one view; None without a plan."""
+        total_s = sum(station.estimated_s for station in self.stations)
+        able = sum(view.outcome != "refused" for view in self.views)
+        return total_s / able if total_s > 0 and able else None
+
 
 LIVE = 0  # shown to a person while the arm moves
 WAITED = 1  # a step waits for it
@@ -376,3 +465,79 @@ class RunState:
     def deviations_told(self) -> str:
         """The number of deviations as text, such as `1 deviation`."""
         return counted(len(self.deviations), "deviation")
+
+
+# What a step forgets when its work is done again.
+UNMEASURED: Mapping[str, Any] = {
+    "measures": {},
+    "artefacts": (),
+    "result": {},
+    "uncertainties": {},
+    "verdicts": (),
+    "gates_passed": False,
+    "gates_sha256": "",
+    "accepted": None,
+    "signed": False,
+    "signed_by": "",
+    "failure": None,
+}
+# What a step knows of waits for a person when the work of an attempt begins.
+NOT_WAITING: Mapping[str, Any] = {"waits_since_utc": "", "waited_s": 0.0}
+
+
+def wait(protocol: Protocol, state: RunState, event: Event) -> RunState:
+    """Let the arm's work wait from now on for a person; work without an arm goes on meanwhile."""
+    if not protocol.step(state.current).moves_robot or state.step.waits_since_utc:
+        return state
+    return change(state, state.current, waits_since_utc=event.at_utc)
+
+
+def wait_no_more(state: RunState, event: Event) -> RunState:
+    """Record that a person has let the work go on."""
+    since_utc, waited_s = state.step.waits_since_utc, state.step.waited_s
+    if not since_utc:
+        return state
+    waited_s += seconds_between(since_utc, event.at_utc)
+    state = change(state, state.current, waits_since_utc="", waited_s=waited_s)
+    return replace(state, last_view=("", ""))  # the time until the next one is not that of a view
+
+
+def go(protocol: Protocol, state: RunState, trigger: str, **changes: Any) -> RunState:
+    """Fire a trigger and apply `changes` to the step that the run was at. Raises IllegalTransitionError."""
+    machine = lifecycle(protocol.step_ids)
+    target = machine.next(state.machine_state, trigger)
+    steps = {**state.steps, state.current: replace(state.step, **changes)}
+    place = machine.place(target)
+    if place is None:
+        status = COMPLETED if target == COMPLETED else ABORTED
+        return replace(state, machine_state=target, status=status, steps=steps)
+    steps[place.step] = replace(steps[place.step], phase=place.phase)
+    status = "paused" if place.paused else "active"
+    return replace(state, machine_state=target, status=status, current=place.step, steps=steps)
+
+
+def change(state: RunState, step: str, **changes: Any) -> RunState:
+    """Replace fields of one step."""
+    return replace(state, steps={**state.steps, step: replace(state.steps[step], **changes)})
+
+
+def pass_on(protocol: Protocol, state: RunState) -> RunState:
+    """Advance from a passed step to the next one; after the last step the run waits for run_completed."""
+    return state if state.current == protocol.step_ids[-1] else go(protocol, state, "advance")
+
+
+def supersede(
+    state: RunState, event: Event, step: str, reason: str, viewpoint: str | None, captured: Mapping[str, int]
+) -> RunState:
+    """List an attempt, or one viewpoint of it, as superseded by `event`."""
+    now = state.steps[step]
+    past = Superseded(event.seq, step, now.attempt, reason, viewpoint, captured, began=bool(now.started_utc))
+    return replace(state, superseded=(*state.superseded, past))
+
+
+def deviate(state: RunState, event: Event, kind: DeviationKind, step: str | None, text: str) -> RunState:
+    """List a deviation that `event` caused, or an automatic confirmation, which is none."""
+    one = Deviation(event.seq, kind, step, text, event.actor)
+    if kind == "automatic":
+        return replace(state, automatic=(*state.automatic, one))
+    return replace(state, deviations=(*state.deviations, one))

@@ -11,14 +11,8 @@ from service.computations import calibrate
 from service.computations.calibrate.records import HandEye, KnownBoard
 from service.computations.records import Camera, Matrix, matrix
 from service.core.errors import ConfigurationError
-from service.core.protocol.step_params import (
-    NAMES_CALIBRATION,
-    NAMES_CAPTURE,
-    MovingParams,
-    NeededDevice,
-    RepeatedStep,
-)
-from service.core.records.events import Record
+from service.core.records.base import Record
+from service.core.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, MovingParams, NeededDevice, RepeatedStep
 from service.core.units import metres
 from service.steps.context import (
     ROBOT_MOVES,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from service.core.protocol.step_params import RepeatedStep, StepParams
-from service.core.records.events import Record
+from service.core.records.base import Record
+from service.core.step_params import RepeatedStep, StepParams
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 

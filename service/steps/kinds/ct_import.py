@@ -11,8 +11,8 @@ from drivers.interfaces import CtSeries, CtSource, CtVolume
 from service.computations import ct_surface, locate_spheres
 from service.computations.records import Point, SphereDetails
 from service.core.errors import DataError
-from service.core.protocol.step_params import NeededDevice, RepeatedStep, StepParams
-from service.core.records.events import ArtefactRef, Record
+from service.core.records.base import ArtefactRef, Record
+from service.core.step_params import NeededDevice, RepeatedStep, StepParams
 from service.core.units import metres, mm
 from service.steps.arrivals import keep_array, keep_clean, keep_mesh, layout_uncertainties, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome

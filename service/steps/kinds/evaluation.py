@@ -11,7 +11,8 @@ from typing import Annotated, ClassVar
 from service.computations import evaluate, locate_spheres, register
 from service.core.errors import ConfigurationError
 from service.core.jobs import Reference
-from service.core.protocol.step_params import (
+from service.core.records.base import Record
+from service.core.step_params import (
     NAMES_CAPTURE,
     NAMES_CT,
     NAMES_REGISTRATION,
@@ -20,7 +21,6 @@ from service.core.protocol.step_params import (
     RepeatedStep,
     StepParams,
 )
-from service.core.records.events import Record
 from service.core.units import metres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures, Share

@@ -15,9 +15,9 @@ from service.computations.kind import read_part
 from service.computations.records import Mounting, Point, PosedPhotograph, has_poses
 from service.core.errors import ConfigurationError
 from service.core.jobs import Each, Jobs, Reference, jobs_of
-from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAMES_SCAN, RepeatedStep, StepParams
-from service.core.records.events import Record
+from service.core.records.base import Record
 from service.core.run.state import JobState
+from service.core.step_params import NAMES_CT, NAMES_REGISTRATION, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.units import metres
 from service.steps.context import EarlierAnswer, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, Deg, ErrorMm, Measure, MeasureRecord, Share

@@ -7,11 +7,11 @@ from typing import Annotated
 
 from drivers.stated_settings import agrees
 from service.core.errors import ConfigurationError, DataError
-from service.core.protocol.models import CameraSection
-from service.core.protocol.step_params import StepParams
-from service.core.records.events import ArtefactRef, Record, ViewImported
+from service.core.protocol import CameraSection
+from service.core.records.base import ArtefactRef, Record
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList, PhotographRole
-from service.core.records.optics import RecordedOptics
+from service.core.records.run_events import RecordedOptics, ViewImported
+from service.core.step_params import StepParams
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 from service.steps.retakes import departing_images, optics_departures

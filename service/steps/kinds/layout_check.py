@@ -12,9 +12,10 @@ from pydantic import Field
 from drivers.errors import ReleasedElsewhereError
 from service.computations import layout
 from service.computations.records import Point
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.step_params import NeededDevice, RepeatedStep, StepParams
-from service.core.records.events import ArtefactRef, GateVerdict, Record
+from service.core.gates import evaluate_gates
+from service.core.records.base import ArtefactRef, Record
+from service.core.records.run_events import GateVerdict
+from service.core.step_params import NeededDevice, RepeatedStep, StepParams
 from service.core.units import metres
 from service.steps.arrivals import keep, layout_uncertainties
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome

@@ -16,7 +16,8 @@ from service.computations import detect_spheres, further_camera, register, term
 from service.computations.register import Registration
 from service.core.errors import ComputeError
 from service.core.jobs import arguments_name
-from service.core.records.events import ComputedBy, Record
+from service.core.records.base import Record
+from service.core.records.run_events import ComputedBy
 from service.steps.context import JobResult, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, ErrorMm, Measure, MeasureRecord, Px, Ratio, RegistrationMeasures
 from service.steps.registration import PLANNED, RegistrationParams, decisive, search_for_spheres

@@ -13,11 +13,10 @@ from drivers.interfaces import ScanExport
 from service.computations import locate_spheres, merge_scans
 from service.computations.records import Point, SphereDetails
 from service.core.jobs import Reference
-from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
-from service.core.records.base import elapsed
-from service.core.records.events import ArtefactRef, Record
-from service.core.text.words import counted
+from service.core.records.base import ArtefactRef, Record, elapsed
+from service.core.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
 from service.core.units import metres
+from service.core.words import counted
 from service.steps.arrivals import keep_mesh, layout_uncertainties, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.kinds import timed_application

@@ -7,10 +7,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import BaseModel
 
-from service.core.protocol.step_params import RepeatedStep, StepParams
-from service.core.records.base import Moment
-from service.core.records.events import Record
+from service.core.records.base import Moment, Record
 from service.core.run.state import Note
+from service.core.step_params import RepeatedStep, StepParams
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 

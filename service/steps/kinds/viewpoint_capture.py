@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Annotated, ClassVar, Literal
 
 from service.compute.planning.motion_plan import Order
-from service.core.protocol.step_params import MovingParams, NeededDevice, RepeatedStep
-from service.core.records.events import Record
+from service.core.records.base import Record
+from service.core.step_params import MovingParams, NeededDevice, RepeatedStep
 from service.steps.context import ROBOT_MOVES, Announcement, StepContext, StepKind, StepOutcome
 from service.steps.due_jobs import EarlyFeatures
 from service.steps.live_numbers import LiveAnalysis, LiveParams

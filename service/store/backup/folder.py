@@ -22,7 +22,7 @@ from typing import Literal
 from pydantic import ValidationError
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.records.events import Record
+from service.core.records.base import Record
 from service.store.access import close_to_others
 from service.store.artefacts import TEMPORARY, ArtefactFiles
 from service.store.durable_effects import Files, IdSource

@@ -8,8 +8,8 @@ from datetime import datetime, timedelta
 
 from sqlalchemy import Connection, func, insert, select, text, update
 
-from service.core.text.words import counted
 from service.core.units import gigabytes
+from service.core.words import counted
 from service.store.database.tables import copies, event_index
 from service.store.durable_effects import utc_text
 from service.store.store import Store

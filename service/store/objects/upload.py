@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.text.words import counted
+from service.core.words import counted
 from service.store.artefacts import relative_path
 from service.store.durable_effects import utc_text
 from service.store.objects.anchors import AnchorWriter

@@ -15,7 +15,7 @@ from threading import Event, Lock, Thread
 from typing import Protocol, Self
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.text.words import time_here
+from service.core.words import time_here
 from service.store.durable_effects import Clock, DurableFiles, Files, Signal, utc_text
 from service.store.journal.journal import Tail, read_tail
 from service.store.journal.lines import NAME as JOURNAL_NAME

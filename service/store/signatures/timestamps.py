@@ -25,7 +25,8 @@ from rfc3161_client import (
 )
 from sqlalchemy import insert, select
 
-from service.core.records.events import DeviceTrouble, TimeStampKept
+from service.core.records.events import TimeStampKept
+from service.core.records.run_events import DeviceTrouble
 from service.store.database.tables import timestamps
 from service.store.durable_effects import utc_text
 from service.store.events import sha256_text

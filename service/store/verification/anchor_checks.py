@@ -11,7 +11,7 @@ from datetime import UTC, date, datetime, timedelta
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from service.core.text.words import counted
+from service.core.words import counted
 from service.store.objects.anchor_forms import (
     ROOTS,
     LineAnchor,

@@ -10,7 +10,8 @@ from typing import Any, Literal
 from pydantic_core import ValidationError
 
 from service.core.errors import StoreError
-from service.core.records.events import PAYLOAD, ArtefactRef, SignaturesWrittenAgain
+from service.core.records.base import ArtefactRef
+from service.core.records.events import PAYLOAD, SignaturesWrittenAgain
 from service.store.artefacts import record_sha256
 from service.store.events import ROOT, canonical_parsed, event_sha256_of_text, parse_canonical, references
 from service.store.records import SITE

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from service.core.recorded_devices import recorded_report
-from service.core.text.words import counted
 from service.core.units import deg, mm
+from service.core.words import counted
 
 if TYPE_CHECKING:
-    from service.core.arms.model import ArmModel
+    from service.core.arms import ArmModel
 
 NOT_COMPARED = " are not compared, because "  # in every sentence on views that are not judged
 
@@ -57,7 +57,7 @@ class _OpenedArm:
 
     @classmethod
     def of(cls, model: str) -> _OpenedArm:
-        from service.core.arms.model import known_arm  # noqa: PLC0415 - searches for plug-ins
+        from service.core.arms import known_arm  # noqa: PLC0415 - searches for plug-ins
 
         arm = known_arm(model)
         if arm is None:
@@ -91,7 +91,7 @@ class PoseFacts:
             return
         import numpy as np  # noqa: PLC0415 - which few verifications need
 
-        from service.core.arms.model import fits, flange_pose, pose_gap  # noqa: PLC0415
+        from service.core.arms import fits, flange_pose, pose_gap  # noqa: PLC0415
 
         joints, pose = np.array(view.joints_rad, dtype=float), np.array(view.T_base_flange, dtype=float)
         arms = [arm.kinematics for arm in self._arms.values()]

@@ -13,9 +13,9 @@ from pydantic import BaseModel, Field, ValidationInfo, field_validator
 from service.audit.export.exports import Exports, Formats, What, zip_chunks
 from service.audit.export.wanted import WantedExport
 from service.core.errors import ConfigurationError, IllegalTransitionError
-from service.core.gates.release import refuse_data_set, refuse_export, refuse_release, release_meaning
+from service.core.gates import refuse_data_set, refuse_export, refuse_release, release_meaning
 from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement
-from service.core.records.events import RunReleased
+from service.core.records.run_events import RunReleased
 from service.people.person import NotAllowedError, Person
 from service.people.tries import on_screen_of
 from service.run_acts import release_run, require_releasable

@@ -15,9 +15,9 @@ from service.audit.overview.digest import Digest
 from service.audit.overview.findings import correct
 from service.audit.overview.signatures import signatures
 from service.audit.record import rows, search
-from service.core.clocks import clock_offset_words, clock_readings
-from service.core.gates.measure_names import measure_name
-from service.core.protocol.models import Protocol, Step
+from service.core.measure_names import measure_name
+from service.core.protocol import Protocol, Step
+from service.core.recorded_devices import clock_offset_words, clock_readings
 from service.core.run.state import RunState, StepState
 from service.dataset.registrations import evaluated, own_registration
 from service.steps import step_kinds

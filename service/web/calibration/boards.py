@@ -20,13 +20,13 @@ from service.compute.board.board import Board
 from service.compute.board.next_poses import SuggestedPose, suggest_board_poses
 from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.estimate import HandEyeAnswer
-from service.core.arms.model import known_arm
+from service.core.arms import known_arm
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, Transform, inverse
-from service.core.protocol.models import CalibrationBoard as BoardSection
-from service.core.records.events import ViewpointCaptured
-from service.core.text.words import counted
+from service.core.protocol import CalibrationBoard as BoardSection
+from service.core.records.run_events import ViewpointCaptured
 from service.core.units import deg, metres, mm
+from service.core.words import counted
 from service.followed_run import RunRecord
 from service.rig import Rig
 from service.steps.board_plan import describe_prediction

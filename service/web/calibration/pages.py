@@ -9,10 +9,10 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
 from service.core.errors import IllegalTransitionError
-from service.core.gates.acceptance import AcceptedGate, depends_on
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import figure
-from service.core.records.events import Event, ViewpointCaptured
+from service.core.gates import AcceptedGate, depends_on, figure
+from service.core.measure_names import measure_name
+from service.core.records.events import Event
+from service.core.records.run_events import ViewpointCaptured
 from service.followed_run import RunRecord
 from service.web.calibration.view import (
     Calibration,

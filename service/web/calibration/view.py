@@ -11,10 +11,10 @@ from pydantic import BaseModel
 from service.computations import calibrate
 from service.computations.calibrate.records import ArmAnswer, HandEye, Intrinsics, Residuals
 from service.computations.records import Camera
-from service.core.protocol.models import Step
+from service.core.protocol import Step
 from service.core.recorded_devices import RecordedIdentity, recorded_report
-from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
-from service.core.records.optics import RecordedOptics
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import DeviceOpened, OperatorAction, RecordedOptics, RecordedView
 from service.core.run.state import StepState
 from service.followed_run import RunRecord
 from service.steps.kinds.calibration import Params

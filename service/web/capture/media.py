@@ -19,8 +19,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy import select
 
 from service.core.errors import OrthocaptureError
-from service.core.records.base import age_s
-from service.core.records.events import ArtefactRef
+from service.core.records.base import ArtefactRef, age_s
 from service.followed_run import RunRecord
 from service.monitor.snapshot import ask_for_frames, frame_path
 from service.notes import NOTE_PHOTOGRAPH

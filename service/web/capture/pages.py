@@ -13,7 +13,7 @@ from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
 from service.computations.live_summary import Suggestion
-from service.core.protocol.models import Step
+from service.core.protocol import Step
 from service.followed_run import RunRecord
 from service.people.control import Control
 from service.people.person import Person

@@ -11,10 +11,9 @@ from typing import Literal
 import numpy as np
 
 from service.computations import further_view, live_summary, live_view
-from service.core.gates.verdict import limits
-from service.core.protocol.models import Protocol, Step
-from service.core.records.events import OperatorAction, ViewpointCaptured
-from service.core.records.optics import RecordedOptics
+from service.core.gates import limits
+from service.core.protocol import Protocol, Step
+from service.core.records.run_events import OperatorAction, RecordedOptics, ViewpointCaptured
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad

@@ -16,8 +16,9 @@ from service.audit.background import ChildProcesses, ChildState
 from service.benchmark.records import SCENARIOS, read_results
 from service.computations.benchmark import KIND, BenchmarkResult
 from service.core.errors import DataError, IntegrityError
-from service.core.gates.release import refuse_data_set
-from service.core.records.events import Event, EvidenceExported, JobFinished
+from service.core.gates import refuse_data_set
+from service.core.records.events import Event
+from service.core.records.run_events import EvidenceExported, JobFinished
 from service.core.run.state import RunState
 from service.dataset.preview_records import AT_LEAST, FILE_NAME, Preview, ViewPreview, read_preview
 from service.store.durable_effects import Clock

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from service.core.protocol.models import Step
-from service.core.records.events import CaptureAsked
+from service.core.protocol import Step
+from service.core.records.run_events import CaptureAsked
 from service.core.run.actions import capture_refusal
 from service.followed_run import RunRecord
 from service.people.control import Control

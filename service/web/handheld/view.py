@@ -11,11 +11,11 @@ import numpy as np
 
 from service.computations import coverage_points, hand_board, hand_view
 from service.computations.records import Matrix, image_of
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import quantity
-from service.core.protocol.models import Protocol, Step
+from service.core.gates import quantity
+from service.core.measure_names import measure_name
+from service.core.protocol import Protocol, Step
 from service.core.recorded_devices import recorded_report
-from service.core.records.events import DeviceOpened, ViewHeld
+from service.core.records.run_events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
 from service.followed_run import RunRecord
 from service.steps.handheld import failure_words

@@ -15,8 +15,8 @@ from service.audit.filters import RunSearch
 from service.audit.runs.comparison import ComparedRun, compare_runs
 from service.audit.runs.search import RESULT_WORDS, find_runs
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.gates.measure_names import measure_name
-from service.core.protocol.models import LoadedProtocol, Protocol, irreversible_warning, load_protocol
+from service.core.measure_names import measure_name
+from service.core.protocol import LoadedProtocol, Protocol, irreversible_warning, load_protocol
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.core.run.state import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of

@@ -22,7 +22,7 @@ from starlette.exceptions import HTTPException
 from service.audit.overview.first_page import kind_name
 from service.core.errors import ConfigurationError, DataError, IntegrityError, OrthocaptureError, ProtocolError
 from service.core.records.entered import RunAbout, about_rows
-from service.core.text.words import counted, local_time
+from service.core.words import counted, local_time
 from service.people import person as people
 from service.store.records import UnknownRunError
 from service.web.page.robot_banner import LOST

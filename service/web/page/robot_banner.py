@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Literal
 
 from service.core.run.state import Loss, RunState, connected_arms, lost_arms
-from service.core.text.words import time_here
+from service.core.words import time_here
 from service.monitor.snapshot import STALE_S, Snapshot
 
 Tone = Literal["moving", "standing", "paused", "unknown", "stop"]

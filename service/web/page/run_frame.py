@@ -6,18 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.errors import OrthocaptureError, what_of
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import Standing as GateStanding
-from service.core.gates.verdict import figure, standing, unit_of
-from service.core.protocol.models import Protocol, Step
-from service.core.records.events import GateVerdict
+from service.core.gates import Standing as GateStanding
+from service.core.gates import figure, standing, unit_of
+from service.core.measure_names import measure_name
+from service.core.protocol import Protocol, Step
 from service.core.records.import_list import imported_sentence
+from service.core.records.run_events import GateVerdict
 from service.core.recovery import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator, Decision, decide
 from service.core.run.expected import tries_words
-from service.core.run.noted import Mending
-from service.core.run.state import RunState, StepState, lost_arms
-from service.core.text.words import time_here
+from service.core.run.state import Mending, RunState, StepState, lost_arms
+from service.core.words import time_here
 from service.followed_run import RunRecord
 from service.monitor.snapshot import STOPS, RobotPhase, Standing, read_snapshot
 from service.people.control import Control

@@ -12,14 +12,9 @@ from typing import TYPE_CHECKING
 from service.computations import board_view, calibrate, further_view, live_view
 from service.computations.calibrate.records import Intrinsics
 from service.computations.records import image_of
-from service.core.protocol.models import Step
-from service.core.records.events import (
-    Event,
-    FurtherExposure,
-    RecordedView,
-    ViewpointCaptured,
-    ViewpointFailed,
-)
+from service.core.protocol import Step
+from service.core.records.events import Event
+from service.core.records.run_events import FurtherExposure, RecordedView, ViewpointCaptured, ViewpointFailed
 from service.core.run.state import JobState, RunState, StepState, Superseded
 from service.followed_run import RunRecord
 from service.rig import RigSection, parse_recorded_rig

@@ -20,7 +20,7 @@ from service.compute.poses.camera_files import read_camera_json
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs import jobs_of
-from service.core.protocol.step_params import Gives
+from service.core.step_params import Gives
 from service.core.units import metres
 from service.dataset.further_cameras import further_pose
 from service.dataset.registrations import best_registration, further_cameras, registrations

@@ -10,7 +10,7 @@ from threading import Lock
 import numpy as np
 
 from service.core.geometry import Transform
-from service.core.protocol.models import Step
+from service.core.protocol import Step
 from service.followed_run import RunRecord
 from service.steps.context import StationLayout
 from service.steps.kinds import calibration

@@ -9,9 +9,9 @@ from fastapi.responses import RedirectResponse
 from pydantic import BaseModel, Field
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
-from service.core.protocol.models import full_reason, load_protocol
-from service.core.records.entered import NoteTaken, about_run, require_specimen
-from service.core.records.events import (
+from service.core.protocol import full_reason, load_protocol
+from service.core.records.entered import REASON_CHARACTERS, NoteTaken, about_run, reason_of, require_specimen
+from service.core.records.run_events import (
     ActionRefused,
     ControlTaken,
     DeviceOpened,
@@ -29,7 +29,6 @@ from service.core.records.events import (
 )
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import RunState, lost_arms
-from service.core.text.words import REASON_CHARACTERS, reason_of
 from service.followed_run import RunRecord
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for

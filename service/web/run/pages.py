@@ -19,11 +19,12 @@ from starlette.datastructures import UploadFile
 
 from service.computations.evaluate import Row
 from service.core.errors import DataError, OrthocaptureError
-from service.core.gates.acceptance import AcceptedGate, accepted_gates
-from service.core.gates.release import loses_release
-from service.core.protocol.models import Reasons, Step
+from service.core.gates import AcceptedGate, accepted_gates, loses_release
+from service.core.protocol import Reasons, Step
+from service.core.records.base import ArtefactRef
 from service.core.records.entered import NoteTaken, about_rows
-from service.core.records.events import ArtefactRef, ControlTaken, Event, RunStarted
+from service.core.records.events import Event
+from service.core.records.run_events import ControlTaken, RunStarted
 from service.dataset.registrations import evaluated, shared_adjustment_note
 from service.followed_run import RunRecord
 from service.monitor.snapshot import STALE_S, read_snapshot

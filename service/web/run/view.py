@@ -6,17 +6,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from service.core.clocks import clock_readings
 from service.core.disk_space import Forecast
-from service.core.gates.acceptance import acceptors, demanded_role, dependent_steps, depends_on, failed_gates
-from service.core.protocol.models import Protocol, Step, irreversible_warning
-from service.core.records.events import Event, FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
+from service.core.gates import acceptors, demanded_role, dependent_steps, depends_on, failed_gates
+from service.core.protocol import Protocol, Step, irreversible_warning
+from service.core.recorded_devices import clock_readings
+from service.core.records.events import Event
+from service.core.records.run_events import FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
 from service.core.recovery import WayOn, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.decide import AskOperator, lapsed_words
 from service.core.run.expected import EarlierTimes, away_words, run_words, step_words, tries_words, work_words
 from service.core.run.state import RunState, lost_arms
-from service.core.text.words import time_here
+from service.core.words import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.run_record import OpenJob

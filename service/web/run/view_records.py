@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 from typing import Protocol as Interface
 
 from service.computations.evaluate import Row
-from service.core.clocks import ClockReading
 from service.core.disk_space import Forecast, size_words
-from service.core.gates.acceptance import AcceptedGate
-from service.core.gates.measure_names import measure_name
-from service.core.gates.verdict import figure
-from service.core.protocol.models import Gate, Protocol, Step
-from service.core.records.events import Event, GateVerdict, OperatorAction, OperatorVerb, RecordedView, SessionStarted
+from service.core.gates import AcceptedGate, figure
+from service.core.measure_names import measure_name
+from service.core.protocol import Gate, Protocol, Step
+from service.core.recorded_devices import ClockReading
+from service.core.records.events import Event
+from service.core.records.run_events import GateVerdict, OperatorAction, OperatorVerb, RecordedView, SessionStarted
 from service.core.run.expected import duration
 from service.core.run.state import Deviation, RunState, StepState
-from service.core.text.words import counted, time_here
+from service.core.words import counted, time_here
 from service.monitor.snapshot import Snapshot
 from service.run_record import OpenJob
 from service.steps.notes import images_taken

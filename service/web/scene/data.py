@@ -16,9 +16,10 @@ from service.computations.records import Point
 from service.computations.register import Registration
 from service.compute.evaluation.error_budget import Alignment
 from service.core.geometry import Array, Transform, inverse
-from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
-from service.core.text.words import counted
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import RecordedView, ViewpointCaptured
 from service.core.units import deg, metres, mm
+from service.core.words import counted
 from service.dataset.further_cameras import KnownFurtherCamera, further_poses
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated, viewing_frame

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
 from service.computations import fuse
-from service.core.gates.acceptance import accepted_gates
+from service.core.gates import accepted_gates
 from service.followed_run import RunRecord
 from service.people.control import Control
 from service.run_acts import drawing_step, read_region, step_to_draw_for

@@ -19,7 +19,7 @@ from service.audit.provenance import draw, graphs, origin
 from service.audit.record import rows, search
 from service.audit.record.search import EventPage
 from service.core.errors import DataError
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.run_start import recorded_run

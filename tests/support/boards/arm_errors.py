@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.arm_correction import CorrectedMounting
 from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, transform
 from service.core.units import mm

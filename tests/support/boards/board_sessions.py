@@ -17,7 +17,7 @@ from service.compute.board.board import Board
 from service.compute.board.design import CalibrationTargets
 from service.compute.camera_model import CameraModel
 from service.compute.hand_eye.reprojection import BoardCorners
-from service.core.arms.model import arm_model
+from service.core.arms import arm_model
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection
 from service.steps.board_plan import Planner, nominal_board, nominal_camera, preview_board

@@ -15,7 +15,7 @@ from sqlalchemy import update
 
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
 from service.core.records.base import elapsed
-from service.core.records.events import OperatorAction, SessionStarted
+from service.core.records.run_events import OperatorAction, SessionStarted
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.figures import read_health

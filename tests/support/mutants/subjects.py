@@ -8,7 +8,7 @@ from pathlib import Path
 # Glob patterns; `**` takes whole folders.
 SUBJECTS: dict[str, tuple[str, ...]] = {
     "decide": ("service/core/run/**/*.py", "service/core/recovery.py"),
-    "gates": ("service/core/gates/*.py", "service/core/protocol/rules.py"),
+    "gates": ("service/core/gates.py", "service/core/protocol.py"),
     "leases": ("service/store/runs.py", "service/store/jobs.py"),
     "chain": ("service/store/events.py", "service/store/store.py", "service/store/durable_effects.py"),
     "signatures": ("service/store/signatures/*.py",),

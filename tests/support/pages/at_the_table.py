@@ -8,7 +8,8 @@ from contextlib import contextmanager
 
 from playwright.sync_api import Browser, expect
 
-from service.core.records.events import OperatorAction, Payload
+from service.core.records.events import Payload
+from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.store.store import Store

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import ItemTicked, OperatorAction
+from service.core.records.run_events import ItemTicked, OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from tests.support.pages.web import web_site

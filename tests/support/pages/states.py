@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import DeviceOpened, DeviceTrouble, OperatorAction, StepStarted
+from service.core.records.run_events import DeviceOpened, DeviceTrouble, OperatorAction, StepStarted
 from service.monitor.snapshot import Snapshot, write_snapshot
 from tests.support.pages.at_the_table import left_at
 from tests.support.pages.forms import PageForm, forms_of

@@ -17,7 +17,7 @@ import trimesh
 
 from service.compute.poses.camera_files import write_camera_json
 from service.compute.poses.pose_files import write_poses_csv
-from service.core.records.events import JobFailed
+from service.core.records.run_events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.processes.forked import Forked, run

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from service.core.protocol.models import parse_protocol
+from service.core.protocol import parse_protocol
 from service.core.records.events import PAYLOAD
 from service.steps import kinds
 

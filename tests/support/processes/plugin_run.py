@@ -12,7 +12,7 @@ from service.audit.background import PartialProgress
 from service.audit.provenance import draw, graphs
 from service.audit.record.run import read_run
 from service.audit.replay.replay import replay
-from service.core.protocol.models import parse_protocol
+from service.core.protocol import parse_protocol
 from service.steps import params_models
 from service.steps.protocol_check import implausible
 from service.store.signatures.signing import checkpoint

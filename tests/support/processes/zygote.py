@@ -197,9 +197,9 @@ class _Zygote:
 
 def _do_once_for_all() -> None:
     """Do what most children would do first, as far as they import what it takes."""
-    if "service.core.declared_kinds" in sys.modules:
-        sys.modules["service.core.declared_kinds"].plug_ins("")  # searches the installed packages
-    if "service.core.protocol.models" in sys.modules and "service.store.events" in sys.modules:
+    if "service.core.loading" in sys.modules:
+        sys.modules["service.core.loading"].plug_ins("")  # searches the installed packages
+    if "service.core.protocol" in sys.modules and "service.store.events" in sys.modules:
         importlib.import_module("tests.support.processes.first_reading").read_once()
     if "service.web.page.rendering" in sys.modules:
         importlib.import_module("tests.support.pages.compiled_templates").keep_compiled_templates()

@@ -9,14 +9,12 @@ from typing import Any
 
 from pydantic import Field
 
-from service.core.protocol.models import LoadedProtocol, Protocol, parse_protocol
-from service.core.protocol.step_params import MovingParams, StepParams
-from service.core.records.events import (
-    ArtefactRef,
-    Event,
+from service.core.protocol import LoadedProtocol, Protocol, parse_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Event, Payload
+from service.core.records.run_events import (
     OperatorAction,
     OperatorVerb,
-    Payload,
     RunStarted,
     StepMeasured,
     StepPassed,
@@ -25,6 +23,7 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.core.run.decide import AskOperator, Decision, RunState, advance, decide, evaluate_gates, initial_state
+from service.core.step_params import MovingParams, StepParams
 
 
 class ChecklistParams(StepParams):

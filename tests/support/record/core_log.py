@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import re
 
-from service.core.records.events import (
-    OperatorAction,
-    Payload,
-    StepFailed,
-)
+from service.core.records.events import Payload
+from service.core.records.run_events import OperatorAction, StepFailed
 from service.core.run.actions import refuse
 from tests.support.record.core import GOOD, Log
 

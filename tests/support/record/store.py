@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
 
-from service.core.records.events import ArtefactRef, RunStarted, ViewpointCaptured
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import RunStarted, ViewpointCaptured
 from service.store.durable_effects import DurableFiles
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.store import Store

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from service.audit.record.run import read_run
 from service.cli.main import app
-from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished
+from service.core.records.events import Event
+from service.core.records.run_events import JobEnqueued, JobFailed, JobFinished
 from service.machine.executors import VARIABLE
 from service.store.store import Store
 from service.worker.loop import work

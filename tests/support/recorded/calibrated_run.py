@@ -15,10 +15,10 @@ from service.computations.conversion import hand_eye_record
 from service.compute.board.board import BoardView
 from service.compute.board.search import UsableViews
 from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import (
-    ArtefactRef,
+from service.core.gates import evaluate_gates
+from service.core.protocol import parse_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import (
     DeviceOpened,
     FurtherExposure,
     StepMeasured,

@@ -10,18 +10,18 @@ from typing import Any
 
 from service.audit.background import PartialProgress
 from service.audit.overview.digest import Digest, digests
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.models import Step, load_protocol
-from service.core.records.events import (
+from service.core.gates import evaluate_gates
+from service.core.protocol import Step, load_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Payload
+from service.core.records.run_events import (
     ActionRefused,
-    ArtefactRef,
     ControlTaken,
     DeviceOpened,
     DeviceTrouble,
     EvidenceExported,
     FilesKept,
     OperatorAction,
-    Payload,
     RecordCorrected,
     RunCompleted,
     SessionStarted,

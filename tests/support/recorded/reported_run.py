@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 import trimesh
 
-from service.core.arms.model import arm_model, flange_pose
-from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import (
-    ArtefactRef,
+from service.core.arms import arm_model, flange_pose
+from service.core.gates import evaluate_gates
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Payload
+from service.core.records.run_events import (
     DeviceOpened,
     DeviceTrouble,
     OperatorAction,
-    Payload,
     RecordCorrected,
     RunCompleted,
     StepMeasured,

@@ -11,15 +11,9 @@ from typing import Any
 import numpy as np
 
 from service.compute.planning.motion_plan import turn_times_s
-from service.core.protocol.models import Protocol
-from service.core.records.events import (
-    Event,
-    JobFinished,
-    RunCompleted,
-    StepPassed,
-    StepStarted,
-    ViewpointCaptured,
-)
+from service.core.protocol import Protocol
+from service.core.records.events import Event
+from service.core.records.run_events import JobFinished, RunCompleted, StepPassed, StepStarted, ViewpointCaptured
 from service.dataset.summary import RunSummary
 
 _PATIENCE_S = 3.0  # a longer overhead is a pause, a retry or another part of the step

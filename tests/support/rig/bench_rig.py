@@ -33,11 +33,10 @@ from drivers.interfaces import (
 )
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
-from service.core.records.events import OperatorAction
 from service.core.records.import_list import ImportList
+from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
-from service.core.run.noted import HandWork
-from service.core.run.state import RunState
+from service.core.run.state import HandWork, RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner.operator import AnswerBy

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import OperatorAction, ViewpointCaptured
+from service.core.protocol import Protocol, parse_protocol
+from service.core.records.run_events import OperatorAction, ViewpointCaptured
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.rig import load_rig

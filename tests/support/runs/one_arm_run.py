@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import Camera, Device, Lightbox, RobotArm
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.rig import load_rig

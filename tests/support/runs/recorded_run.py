@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from service.core.gates.verdict import evaluate_gates
+from service.core.gates import evaluate_gates
 from service.core.jobs import Reference
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import (
-    ArtefactRef,
+from service.core.protocol import parse_protocol
+from service.core.records.base import ArtefactRef
+from service.core.records.run_events import (
     FilesKept,
     OperatorAction,
     RunCompleted,

@@ -20,7 +20,8 @@ import httpx
 import psutil
 import yaml
 
-from service.core.records.events import Payload, ViewpointCaptured
+from service.core.records.events import Payload
+from service.core.records.run_events import ViewpointCaptured
 from service.core.run.state import RunState
 from service.followed_run import RunFollower
 from service.run_start import recorded_run

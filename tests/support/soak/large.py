@@ -17,7 +17,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.store.verification.verify import verify
 from tests.support.pages.web import Browser, web_site
 from tests.support.soak.fit import Duration, exponent

@@ -16,8 +16,8 @@ import numpy as np
 
 from service.computations import live_view
 from service.computations.records import Camera, Limits, PosedPhotograph
-from service.core.protocol.models import parse_protocol
-from service.core.records.events import ViewpointCaptured
+from service.core.protocol import parse_protocol
+from service.core.records.run_events import ViewpointCaptured
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

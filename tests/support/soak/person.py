@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import IO
 
-from service.core.records.events import StepFailed
+from service.core.records.run_events import StepFailed
 from service.core.run.decide import AskOperator, decide
 from service.followed_run import RunRecord
 

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.computations.job import JobAnswer, RecordedContext
 from service.core.errors import OrthocaptureError
-from service.core.records.events import StepNote
+from service.core.records.run_events import StepNote
 from service.logs.file_log import file_log
 from service.store.records import NewJob
 from service.store.store import Store

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from service.core.protocol.models import parse_protocol
+from service.core.protocol import parse_protocol
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models

@@ -15,7 +15,7 @@ import pytest
 
 from service.audit.record.run import read_run
 from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
-from service.core.records.events import EvidenceExported
+from service.core.records.run_events import EvidenceExported
 from service.dataset.preview_records import (
     DecidedRegion,
     GroundTruthPreview,

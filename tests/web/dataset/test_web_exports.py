@@ -20,8 +20,8 @@ from service.audit.verify import bundle_verifier
 from service.cli.main import app
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.errors import StoreError
-from service.core.gates.release import release_meaning
-from service.core.records.events import EvidenceExported, OperatorAction, RunReleased, ViewpointCaptured
+from service.core.gates import release_meaning
+from service.core.records.run_events import EvidenceExported, OperatorAction, RunReleased, ViewpointCaptured
 from service.core.run.actions import record_to_sign
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState

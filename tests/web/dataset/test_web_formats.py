@@ -16,7 +16,7 @@ from service.audit.export.exports import zip_chunks
 from service.audit.export.process import export
 from service.audit.export.wanted import ExportRequest, WantedExport, keep_request
 from service.core.errors import IntegrityError
-from service.core.records.events import EvidenceExported
+from service.core.records.run_events import EvidenceExported
 from service.dataset.export_folder import SUMS
 from service.dataset.exporter import exporters
 from service.store.verification.verify import verify

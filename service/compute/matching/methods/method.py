@@ -10,8 +10,8 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
-from service.core.declared_kinds import declared_kinds, kind_named
 from service.core.geometry import Array
+from service.core.loading import declared_kinds, kind_named
 
 GROUP = "orthocapture.matchers"
 Picture = NDArray[np.uint8]  # (H, W, 3), blue first

@@ -13,7 +13,7 @@ from pathlib import Path
 from service.audit.overview.findings import correct
 from service.audit.record.starts import record_start
 from service.core.errors import DataError
-from service.core.records.events import EvidenceExported, OperatorAction, RunAborted, RunReleased
+from service.core.records.run_events import EvidenceExported, OperatorAction, RunAborted, RunReleased
 from service.people.control import Control
 from service.people.person import Person, SignInRefusedError
 from service.people.sessions import People

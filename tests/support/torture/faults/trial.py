@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from service.core.errors import OrthocaptureError, StoreError
-from service.core.protocol.models import parse_protocol
+from service.core.protocol import parse_protocol
 from service.core.run.decide import AskOperator, initial_state
 from service.core.run.state import RunState
 from service.run_start import recorded_run, start_run

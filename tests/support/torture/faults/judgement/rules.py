@@ -9,9 +9,9 @@ from pathlib import Path
 
 from drivers import errors as _device_errors
 from service.core.errors import OrthocaptureError
-from service.core.records.events import (
+from service.core.records.events import Event
+from service.core.records.run_events import (
     DeviceOpened,
-    Event,
     OperatorAction,
     StepFailed,
     ViewpointCaptured,

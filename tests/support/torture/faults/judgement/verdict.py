@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from service.core.records.events import DeviceOpened, Event, StepFailed, ViewpointFailed
+from service.core.records.events import Event
+from service.core.records.run_events import DeviceOpened, StepFailed, ViewpointFailed
 from service.core.run.decide import AskOperator
 
 _DIGITS = re.compile(r"\d+(?:[.,]\d+)*")

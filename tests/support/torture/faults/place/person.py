@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from service.core.records.events import OperatorAction
+from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing

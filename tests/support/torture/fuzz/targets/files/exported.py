@@ -20,7 +20,7 @@ from service.benchmark.table import table_markdown
 from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
 from service.compute.ground_truth.surface import Surface, read_ply, write_ply
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
-from service.core.text.files import parse_json
+from service.core.text_files import parse_json
 from service.dataset.export_folder import SUMS
 from service.dataset.exported import data_set_of_folder
 from service.dataset.exporter import exporter, write_data_set

@@ -20,9 +20,9 @@ from service.compute.poses.camera_files import read_camera_json, read_spheres_js
 from service.compute.poses.pose_files import read_colmap_model, read_poses, write_poses_csv, write_transforms_json
 from service.compute.poses.robot_files import read_hand_eye, read_joints_csv, read_stations
 from service.core.geometry import Transform
-from service.core.protocol.models import parse_protocol
+from service.core.protocol import parse_protocol
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList
-from service.core.text.files import parse_json
+from service.core.text_files import parse_json
 from service.import_folder import import_rig
 from service.rig import load_rig
 from service.station import Station
@@ -217,7 +217,7 @@ def _binary_model(data: bytes, folder: Path) -> None:
 
 TARGETS: tuple[Target, ...] = (
     Target(
-        "protocol", "service.core.protocol.models:load_protocol", _protocol, _protocols, TEXT, seconds=4.0, pace=0.2
+        "protocol", "service.core.protocol:load_protocol", _protocol, _protocols, TEXT, seconds=4.0, pace=0.2
     ),
     Target("rig", "service.rig:load_rig", _rig, _rigs, TEXT),
     Target("import_list", "service.rig:load_rig", _rig, _import_lists, JSON),

@@ -20,7 +20,7 @@ import numpy as np
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.dashboard import Dashboard
 from service.cli.operators import SimulatedHands
-from service.core.run.noted import HandWork
+from service.core.run.state import HandWork
 from service.store.events import canonical
 from simulators.faults import FaultPlan
 from simulators.lightbox import FIRMWARES, MODEL, SERIAL, Lightbox, Make

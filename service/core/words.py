@@ -1,4 +1,4 @@
-"""Text as it is printed and as it is recorded: no character of it moves a cursor, hides others or ends a line.
+"""Text for people: counts and times of day; and text from outside, made safe to print and to record.
 
 Names, paths, notes and messages of devices come from outside. A terminal obeys escape sequences in them, and a
 database of another kind refuses NUL and surrogates. Such characters become escapes that can be read, such as `\\x1b`.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import cast
 
 # Control characters; marks that have no width or turn the direction of writing; line separators; surrogates; tags.
@@ -67,3 +68,33 @@ def _escaped(found: re.Match[str]) -> str:
 def _json_escaped(found: re.Match[str]) -> str:
     units = found[0].encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+
+
+SIMULATED = "SIMULATED: made by a simulated rig, not by a camera in front of a specimen"  # in every file with room
+
+
+def counted(number: int, one: str, more: str = "") -> str:
+    """Return a count as text: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""
+    return f"{number or 'no'} {one if number in (0, 1) else more or one + 's'}"
+
+
+def time_utc(at_utc: str) -> str:
+    """Return the time of day of a recorded time (ISO 8601): `20:41:07 UTC`."""
+    return f"{at_utc[11:19]} UTC"
+
+
+def local_time(at_utc: str) -> str:
+    """Return a recorded time on the clock of this machine and its site: `10:12:03 CET`; "" where that is UTC."""
+    try:
+        there = datetime.fromisoformat(at_utc).astimezone()
+    except ValueError:
+        return ""
+    if not there.utcoffset():
+        return ""
+    day = f"{there:%Y-%m-%d} " if f"{there:%Y-%m-%d}" != at_utc[:10] else ""
+    return f"{day}{there:%H:%M:%S} {there.tzname()}"
+
+
+def time_here(at_utc: str) -> str:
+    """Return the time of day of a recorded time on the clock on the wall, and in UTC only where that is the same."""
+    return local_time(at_utc) or time_utc(at_utc)

@@ -1,13 +1,49 @@
-"""Events of the site's own chain: the service, accounts, keys, approvals, restored data."""
+"""Every event: the events of the site's own chain, the union of all payloads, and the envelope."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from service.core.records.base import ArtefactRef, Record
-from service.core.records.events.operator import Identified, OperatorVerb
+from service.core.records.entered import NoteTaken
+from service.core.records.run_events import (
+    ActionRefused,
+    CaptureAsked,
+    ControlTaken,
+    DeviceOpened,
+    DeviceTrouble,
+    EvidenceExported,
+    FilesKept,
+    GatesEvaluated,
+    Identified,
+    ItemTicked,
+    JobEnqueued,
+    JobFailed,
+    JobFinished,
+    LeaveLapsed,
+    OperatorAction,
+    OperatorVerb,
+    RecordCorrected,
+    RegionDrawn,
+    RobotSeen,
+    RunAborted,
+    RunCompleted,
+    RunReleased,
+    RunStarted,
+    SessionStarted,
+    StepFailed,
+    StepMeasured,
+    StepNote,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+    ViewHeld,
+    ViewImported,
+    ViewpointCaptured,
+    ViewpointFailed,
+)
 
 
 class SiteOpened(Record):
@@ -196,3 +232,75 @@ class RecordRebuilt(Record):
     restored_events: int  # the number of these that the old database did not hold any more
     kept: tuple[str, ...]  # files of the data folder that hold what was there before
     lost: tuple[str, ...] = ()  # descriptions of what could not be restored; () if nothing is known to be lost
+
+
+Payload = Annotated[
+    OperatorAction
+    | ActionRefused
+    | RunStarted
+    | SessionStarted
+    | DeviceOpened
+    | DeviceTrouble
+    | LeaveLapsed
+    | StepStarted
+    | StepNote
+    | FilesKept
+    | ViewpointCaptured
+    | ViewImported
+    | ViewHeld
+    | CaptureAsked
+    | RegionDrawn
+    | ViewpointFailed
+    | StepMeasured
+    | StepFailed
+    | StepRetried
+    | GatesEvaluated
+    | StepPassed
+    | JobEnqueued
+    | JobFinished
+    | JobFailed
+    | RunCompleted
+    | RunAborted
+    | ItemTicked
+    | RobotSeen
+    | NoteTaken
+    | ControlTaken
+    | RecordCorrected
+    | RunReleased
+    | EvidenceExported
+    | SiteOpened
+    | ServiceStarted
+    | AccountChanged
+    | SignInRecorded
+    | KeyChanged
+    | RunSigned
+    | SignaturesWrittenAgain
+    | TimeStampKept
+    | LeftoversRemoved
+    | ActionAfterEnd
+    | ProtocolApproved
+    | DataRestored
+    | RecordRebuilt
+    | RecordCopied
+    | RunMoved
+    | RunReceived
+    | SignerNamed,
+    Field(discriminator="kind"),
+]
+PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
+
+
+class Event(Record):
+    """One link of a run's chain.
+
+    `sha256` is SHA-256 over the RFC 8785 canonical JSON of every other field, `previous_sha256` included.
+    """
+
+    seq: int  # 1, 2, 3 … within the run
+    run_id: str
+    at_utc: str  # ISO 8601 with microseconds and Z
+    monotonic_s: float
+    actor: str  # person, device or process
+    payload: Payload
+    previous_sha256: str  # 64 zeros for the root
+    sha256: str

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from service.core.arms.model import ArmModel, flange_pose
+from service.core.arms import ArmModel, flange_pose
 from service.core.geometry import Array, Transform
 
 _ELBOWS = 48  # elbow angles that are tried, 7.5° apart

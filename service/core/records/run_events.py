@@ -1,14 +1,88 @@
-"""What happens in a run: it begins, devices open, steps work and are judged, images and answers arrive, it ends."""
+"""Events of a run: what happens in it, what people do in it, and what a photograph states of its camera."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, cast
 
 from pydantic import Field
 
 from service.core.records.base import ArtefactRef, Record
 from service.core.records.entered import RunAbout
-from service.core.records.optics import RecordedOptics, recorded_optics
+
+# Camera, lens and settings as a photograph states them, read from the field `camera` of a recorded photograph.
+#
+# Drivers of any version, bodies of any maker and other people's files wrote that field: any key may be missing,
+# unknown or of another type, and an event must keep it as it is, because its hash was signed. So the field stays
+# plain JSON, and it is read here and nowhere else (docs/decisions/0021-what-a-photograph-states.md).
+
+
+Plain = Mapping[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedOptics:
+    """Camera, lens and settings as a photograph states them; "" or None: not given."""
+
+    make: str = ""
+    model: str = ""
+    body_serial: str = ""
+    lens: str = ""
+    lens_serial: str = ""
+    focal_length_mm: float | None = None
+    aperture_f: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+    focus_mode: str = ""
+    focus_distance_m: float | None = None
+    focus_position: int | None = None  # of the focus motor, in its own steps
+    width: int | None = None
+    height: int | None = None
+    exif_time: str = ""
+    unread: str = ""  # what could not be read of the file's EXIF
+
+
+def recorded_optics(camera: object) -> RecordedOptics:
+    """Return what the `camera` of a recorded photograph states.
+
+    Zero stands for a number that the camera does not know. Only the focus motor has a position zero.
+    """
+    fields = mapping_of(camera)
+    focus_position = number_of(fields.get("focus_position"))
+    return RecordedOptics(
+        make=text_of(fields.get("make")),
+        model=text_of(fields.get("model")),
+        body_serial=text_of(fields.get("body_serial")),
+        lens=text_of(fields.get("lens")),
+        lens_serial=text_of(fields.get("lens_serial")),
+        focal_length_mm=number_of(fields.get("focal_length_mm")) or None,
+        aperture_f=number_of(fields.get("aperture_f")) or None,
+        exposure_s=number_of(fields.get("exposure_s")) or None,
+        iso=number_of(fields.get("iso")) or None,
+        focus_mode=text_of(fields.get("focus_mode")),
+        focus_distance_m=number_of(fields.get("focus_distance_m")) or None,
+        focus_position=None if focus_position is None else int(focus_position),
+        width=int(number_of(fields.get("width")) or 0) or None,
+        height=int(number_of(fields.get("height")) or 0) or None,
+        exif_time=text_of(fields.get("exif_time")),
+        unread=text_of(fields.get("unread")),
+    )
+
+
+def mapping_of(value: object) -> Plain:
+    """Return a recorded JSON object; an empty one in place of any other value."""
+    return cast("Plain", value) if isinstance(value, Mapping) else {}
+
+
+def text_of(value: object) -> str:
+    """Return a recorded value as text; "" where nothing was given."""
+    return "" if value is None else str(value)
+
+
+def number_of(value: object) -> float | None:
+    """Return a recorded number; None in place of any other value."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 class RunStarted(Record):
@@ -361,3 +435,106 @@ class JobFailed(Record):
     error: str
     message: str
     traceback: str = ""  # only of an unexpected error
+
+
+OperatorVerb = Literal["confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort"]
+# How the person was identified: by a secret of the account, or only by claim (a site without accounts).
+Identified = Literal["", "claimed", "password", "pin", "badge"]
+
+
+class OperatorAction(Record):
+    """A person's action. `automatic` marks a confirmation given by --auto-confirm on a simulated rig."""
+
+    kind: Literal["operator_action"] = "operator_action"
+    action: OperatorVerb
+    step: str | None = None
+    viewpoint: str | None = None  # redo of a single viewpoint
+    reason: str = ""
+    checklist: tuple[str, ...] = ()  # items ticked
+    meaning: str = ""  # the meaning of a signature
+    signed_sha256: str = ""  # hash of the event that was signed
+    role: str = ""  # the person's role, where the action demands one
+    identified: Identified = ""
+    via: Literal["cli", "web", "pedal", "auto"] = "cli"
+    automatic: bool = False
+
+
+class ActionRefused(Record):
+    """An action that the lifecycle or the protocol did not allow; recorded without effect."""
+
+    kind: Literal["action_refused"] = "action_refused"
+    action: OperatorVerb
+    step: str | None
+    why: str
+
+
+class ItemTicked(Record):
+    """A checklist item was ticked or unticked on a screen; all screens show the same ticks."""
+
+    kind: Literal["item_ticked"] = "item_ticked"
+    step: str
+    attempt: int
+    item: str
+    ticked: bool
+
+
+class RobotSeen(Record):
+    """A person has looked at an arm whose connection was lost: it stands still, and nobody is within its reach."""
+
+    kind: Literal["robot_seen"] = "robot_seen"
+    device: str  # name in rig.yaml
+    lost_seq: int = 0  # the event that reported the loss; 0: the program had ended, which no event had reported
+
+
+class ControlTaken(Record):
+    """One screen took control of the run: from now on only it may act on the run; the others may only watch."""
+
+    kind: Literal["control_taken"] = "control_taken"
+    screen: str  # name of the sign-in whose screen it is; "" when control was given back
+    previous: str  # person who had control before; "" for nobody
+    how: Literal["free", "handed_over", "taken_over"]
+    reason: str = ""
+
+
+class RecordCorrected(Record):
+    """A value of an earlier event is corrected. The original stays, and readers see both."""
+
+    kind: Literal["record_corrected"] = "record_corrected"
+    of_seq: int
+    field: str  # path in the payload: environment.light_lux
+    old: Any
+    new: Any
+    reason: str
+
+
+class RegionDrawn(Record):
+    """A person drew a polygon on the 3D view in which one source of the ground truth counts; used by the next fusion.
+
+    In the frame of the scan, metres; `seen_along` points from the surface to the viewer.
+    """
+
+    kind: Literal["region_drawn"] = "region_drawn"
+    step: str  # whose next fusion uses it
+    source: Literal["ct", "scan"]
+    corners_m: tuple[tuple[float, float, float], ...]
+    seen_along: tuple[float, float, float]
+
+
+class RunReleased(Record):
+    """A second person's signature that allows the export of a completed run."""
+
+    kind: Literal["run_released"] = "run_released"
+    meaning: str
+    signed_sha256: str  # the hash of the run_completed event
+    identified: Literal["", "claimed", "password"] = ""  # the way of identification; "" in older records
+
+
+class EvidenceExported(Record):
+    """A bundle, a data set or a report left the system."""
+
+    kind: Literal["evidence_exported"] = "evidence_exported"
+    what: Literal["bundle", "dataset", "report"]
+    file_name: str
+    sha256: str
+    size_bytes: int
+    head_sha256: str  # the chain's hash when it was made

@@ -1,14 +1,15 @@
-"""The lab procedure as typed data: the protocol file's models, its loader and its JSON Schema."""
+"""The lab procedure as typed data: models of the protocol file, rules beyond their types, loader, JSON Schema."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeVar, Union, cast
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -20,13 +21,8 @@ from pydantic import (
     create_model,
 )
 
-from service.core.errors import ProtocolError
-from service.core.protocol.rules import rule_violations
-from service.core.protocol.step_params import Gives, RepeatedStep, StepParams
-from service.core.records.data_set import DataSetStatement
-from service.core.records.events import Record
-from service.core.run.lifecycle import RESERVED_STEP_IDS
-from service.core.text.checked_yaml import (
+from service.core.checked_yaml import (
+    FieldPath,
     Plain,
     YamlProblem,
     YamlTree,
@@ -37,6 +33,115 @@ from service.core.text.checked_yaml import (
     parse_yaml,
     refuse,
 )
+from service.core.errors import ProtocolError
+from service.core.records.base import Record
+from service.core.records.data_set import DataSetStatement
+from service.core.run.lifecycle import RESERVED_STEP_IDS
+from service.core.step_params import Gives, RepeatedStep, StepParams
+
+if TYPE_CHECKING:
+    from drivers.interfaces import Abandoned
+    from service.core.arms import ArmModel
+
+# Measures that no protocol may allow anybody to accept: outside their limits an image or the evidence itself is
+# invalid, and no judgement can change that. Measure → what is wrong then.
+NEVER_ACCEPTED: Mapping[str, str] = {
+    "settings_departures": "means images taken with other settings than the calibration's",
+    "optics_departures": "means images taken through other optics than the calibrated ones",
+    "moved_during_exposure": "means images whose pose is not known",
+    "checklist_items_open": "means that work was not done which the record says is done",
+    "checklist_items_ticked": "means that work was not done which the record says is done",
+    "applications": "means that no coat was applied",
+}
+
+
+def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[FieldPath, str]]:
+    """Yield (field, what is wrong) for the data of a protocol file, which may be malformed in any way."""
+    steps = data.get("steps")
+    seen: dict[str, int] = {}
+    for index, step in enumerate(steps if isinstance(steps, list) else []):
+        if isinstance(step, dict):
+            at: FieldPath = ("steps", index)
+            yield from _identity(step, at, seen)
+            yield from _requires(step, at, seen, _all_ids(cast(list[Plain], steps)))
+            yield from _irreversible(step, at)
+            yield from _gates(step, at, seen, cast(list[Plain], steps))
+            if isinstance(step.get("id"), str):
+                seen.setdefault(str(step["id"]), index)
+
+
+def _all_ids(steps: list[Plain]) -> set[str]:
+    return {str(step["id"]) for step in steps if isinstance(step, dict) and isinstance(step.get("id"), str)}
+
+
+def _identity(step: dict[str, Plain], at: FieldPath, seen: dict[str, int]) -> Iterator[tuple[FieldPath, str]]:
+    step_id = step.get("id")
+    if isinstance(step_id, str) and step_id in seen:
+        yield (*at, "id"), f"duplicate step id {step_id!r}, first used by steps[{seen[step_id]}]"
+
+
+def _requires(
+    step: dict[str, Plain], at: FieldPath, seen: dict[str, int], everyone: set[str]
+) -> Iterator[tuple[FieldPath, str]]:
+    required = step.get("requires")
+    for index, name in enumerate(required if isinstance(required, list) else []):
+        if not isinstance(name, str) or name in seen:
+            continue
+        if name == step.get("id"):
+            message = "a step cannot require itself"
+        elif name in everyone:
+            message = f"step {name!r} comes later; only earlier steps can be required"
+        else:
+            message = f"there is no step {name!r}"
+        yield (*at, "requires", index), message
+
+
+def _irreversible(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
+    if step.get("irreversible") is not True:
+        return
+    where: FieldPath = (*at, "irreversible")
+    if not step.get("requires"):
+        yield where, "an irreversible step needs `requires`: the captures that must have passed before it"
+    if step.get("sign") is not True:
+        yield where, "an irreversible step needs `sign: true`: a person approves that it begins"
+    if step.get("confirm") is False:
+        yield (*at, "confirm"), "an irreversible step is always confirmed by a person"
+
+
+def _gates(
+    step: dict[str, Plain], at: FieldPath, seen: dict[str, int], steps: list[Plain]
+) -> Iterator[tuple[FieldPath, str]]:
+    gates = step.get("gates")
+    measures: set[str] = set()
+    for index, gate in enumerate(gates if isinstance(gates, list) else []):
+        if not isinstance(gate, dict):
+            continue
+        where: FieldPath = (*at, "gates", index)
+        low, high = gate.get("min"), gate.get("max")
+        if low is None and high is None:
+            yield where, "a gate needs limits: min, max or both"
+        if _number(low) and _number(high) and cast(float, low) > cast(float, high):
+            yield (*where, "max"), f"min {low} is above max {high}: nothing could pass"
+        unless = gate.get("unless_skipped")
+        if isinstance(unless, str):
+            named = steps[seen[unless]] if unless in seen else None
+            if not isinstance(named, dict) or named.get("skippable") is not True:
+                yield (*where, "unless_skipped"), f"{unless!r} is not an earlier step that may be skipped"
+        measure = gate.get("measure")
+        if isinstance(measure, str):
+            if gate.get("accept_by") is not None and measure in NEVER_ACCEPTED:
+                yield (
+                    (*where, "accept_by"),
+                    f"{measure!r} outside its limits {NEVER_ACCEPTED[measure]}: nobody accepts it",
+                )
+            if measure in measures:
+                yield (*where, "measure"), f"a second gate on {measure!r}; give min and max in one gate"
+            measures.add(measure)
+
+
+def _number(value: Plain) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
 
 _Text = Annotated[str, Field(min_length=3, max_length=200)]
 
@@ -177,7 +282,7 @@ class Gate(Record):
     unit: str = ""  # the unit of the limits; checked against the unit of the measure
     why: str = ""  # the reason for the limit, for people
     unless_skipped: str | None = None  # the earlier step that the number needs: if it is skipped, there is no gate
-    accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates.acceptance
+    accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates
 
 
 class Recovery(Record):
@@ -436,3 +541,40 @@ def irreversible_warning(protocol: Protocol, step: Step) -> str:
             f"left as it is, but no longer be mended by new measurements: {', '.join(afterwards)}."
         )
     return " ".join([*words, "Read the figures before you go on."])
+
+
+_ROUNDING_S = 1e-9
+
+
+def motion_problems(
+    motion: Motion, arms: Sequence[ArmModel], abandoned: Abandoned | None
+) -> Iterator[tuple[str, str]]:
+    """Yield the fields of a protocol's motion that are too large, with a text that says for what.
+
+    Args:
+        motion: the protocol's section; its speed and acceleration are those of the fastest joint, whichever that is.
+        arms: those that may be meant, at least one; a motion is too fast if it is so for each of them.
+        abandoned: when the controller notices that the program died, and how soon the arm must stand; None if the
+            device sees to that by itself.
+    """
+    arm = max(arms, key=lambda one: float(one.speeds_rad_s.min()))
+    among = f"a {arm.name}" if len(arms) == 1 else f"a {arm.name}, the fastest arm that is known,"
+    joint = int(np.argmin(arm.speeds_rad_s))
+    most_rad_s = float(arm.speeds_rad_s[joint])
+    if motion.speed_rad_s > most_rad_s:
+        yield "speed_rad_s", f"joint {joint + 1} of {among} turns by {most_rad_s:.2f} rad/s at most"
+    most_rad_s2 = max(one.acceleration_rad_s2 for one in arms)
+    if motion.acceleration_rad_s2 > most_rad_s2:
+        yield "acceleration_rad_s2", f"the controller of {among} takes {most_rad_s2:g} rad/s² at most"
+    if abandoned is None:
+        return
+    braking_rad_s2 = max(one.braking_rad_s2 for one in arms)
+    rests_after_s = abandoned.noticed_after_s + motion.speed_rad_s / braking_rad_s2
+    if rests_after_s > abandoned.rest_within_s + _ROUNDING_S:
+        slow_enough_rad_s = max(0.0, abandoned.rest_within_s - abandoned.noticed_after_s) * braking_rad_s2
+        yield (
+            "speed_rad_s",
+            f"if the program dies, the arm stands after {rests_after_s:.2f} s ({abandoned.noticed_after_s:g} s until "
+            f"that is noticed, then braking with {braking_rad_s2:g} rad/s²), and rest_within_s of the rig file "
+            f"allows {abandoned.rest_within_s:g} s: move with {slow_enough_rad_s:.2f} rad/s at most",
+        )

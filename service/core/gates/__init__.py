@@ -1,1 +1,0 @@
-"""Measured figures against their limits: verdicts, acceptance by a person, what depends on it, and release."""
