@@ -32,8 +32,8 @@ from service.core.errors import OrthocaptureError, StoreError
 from service.people.sessions import People
 from service.store.database.engine import DATABASE_NAME
 from service.store.durable_effects import DurableFiles, SystemClock, utc_text
-from service.store.journal.lines import NAME as JOURNAL_NAME
-from service.store.journal.rebuild import rebuild
+from service.store.journal import NAME as JOURNAL_NAME
+from service.store.restoring import rebuild
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.second_place import SecondPlace, journal_copy
 from service.store.signatures.signing import checkpoint

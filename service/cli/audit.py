@@ -43,8 +43,7 @@ from service.followed_run import read_log
 from service.people.authorisation import Identity
 from service.run_acts import release_run, require_releasable
 from service.run_start import recorded_run
-from service.store.access import kept_to
-from service.store.data_folder import data_folder
+from service.store.data_folder import data_folder, kept_to
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
 from service.store.runs import resolve_run

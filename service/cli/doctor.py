@@ -41,11 +41,10 @@ from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.station import Station
 from service.steps import params_models
-from service.store.data_folder import object_store_of
+from service.store.data_folder import object_store_of, why_unsafe
 from service.store.database.opening import has_database
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import Clock, DurableFiles, SystemClock
-from service.store.mounts import why_unsafe
 from service.store.objects.opening import open_objects
 from service.store.objects.probe import ProbeResult, probe
 from service.store.objects.spool import SpoolLevel, spool_level

@@ -251,7 +251,7 @@ def orthocapture(
 ) -> None:
     """Acquire surgical vision data sets that are accurate to a fraction of a millimetre, with proof of origin."""
     if allow_mount:
-        from service.store.mounts import ALLOW  # noqa: PLC0415 - seldom needed
+        from service.store.data_folder import ALLOW  # noqa: PLC0415 - seldom needed
 
         os.environ[ALLOW] = "1"  # for the processes, too, that a command starts
 

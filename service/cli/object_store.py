@@ -17,8 +17,7 @@ from service.core.units import gigabytes
 from service.core.words import counted
 from service.logs.file_log import file_log
 from service.machine.resources import compute_in_background
-from service.store.access import kept_to
-from service.store.data_folder import SITE_FILE
+from service.store.data_folder import SITE_FILE, kept_to
 from service.store.objects.anchors import AnchorWriter
 from service.store.objects.copies import Waiting, read_waiting
 from service.store.objects.freeing import SpoolFile, free_spool, spool_files

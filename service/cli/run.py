@@ -78,7 +78,7 @@ from service.runner.loop import Runner
 from service.station import Station, devices_of, layout_of
 from service.steps import params_models
 from service.steps.due_jobs import duration_words
-from service.store.access import kept_to
+from service.store.data_folder import kept_to
 from service.store.signatures.second_place import away_words
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store

@@ -38,7 +38,7 @@ from service.people.sessions import People
 from service.rig import load_rig
 from service.station import devices_of
 from service.steps import params_models
-from service.store.access import kept_to
+from service.store.data_folder import kept_to
 from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.durable_effects import utc_text
 from service.store.records import SITE

@@ -24,14 +24,12 @@ from service.cli.object_store import gc_spool, upload_command
 from service.cli.options import OperatorOption, PasswordOption, acting_name, acting_person
 from service.core.units import gigabytes
 from service.core.words import counted
-from service.store.backup.backup import BackupOptions, BackupReport, back_up
-from service.store.backup.restore import RestoreReport, restore
-from service.store.copying import copy_record
+from service.store.backup import BackupOptions, BackupReport, back_up
 from service.store.database.preparing import prepare
 from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
-from service.store.journal.rebuild import RebuildReport, rebuild
-from service.store.moving import MoveReport, move_run
+from service.store.moving import MoveReport, copy_record, move_run
 from service.store.records import SITE
+from service.store.restoring import RebuildReport, RestoreReport, rebuild, restore
 from service.store.signatures.signing import checkpoint_here
 from service.store.store import Store
 

@@ -14,7 +14,7 @@ from argon2.exceptions import VerifyMismatchError
 
 from service.core.errors import StoreError
 from service.people.person import AccountError
-from service.store.access import KEYS, PEPPER
+from service.store.data_folder import KEYS, PEPPER
 from service.store.store import Store
 
 PASSWORD_MIN = 10

@@ -14,7 +14,7 @@ from threading import Lock
 from typing import Protocol
 
 from service.core.records.base import Moment
-from service.store.access import file_mode, folder_mode, make_folder, open_new
+from service.store.data_folder import file_mode, folder_mode, make_folder, open_new
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 

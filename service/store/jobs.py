@@ -17,8 +17,7 @@ from service.store.database.changes import notify
 from service.store.database.database import lease_now_s
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
-from service.store.events import append, canonical, parse_canonical
-from service.store.moved import moved_runs
+from service.store.events import append, canonical, moved_runs, parse_canonical
 from service.store.records import EVERY_JOB, Able, Job, LeaseLostError, NewJob
 from service.store.runs import ProcessIdentity, identity_of, identity_values
 

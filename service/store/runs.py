@@ -21,8 +21,7 @@ from service.store.database.database import Database, is_postgres, lease_now_s
 from service.store.database.tables import event_facets, event_index, heads, leases, runs
 from service.store.durable_effects import Clock, IdSource, SystemClock
 from service.store.event_index import OF_FACET
-from service.store.events import ROOT, append
-from service.store.moved import moved_runs
+from service.store.events import ROOT, append, moved_runs
 from service.store.records import SITE, LeaseHeldError, LeaseLostError, NewArtefact, RunRow, UnknownRunError
 
 _ENDS = ("run_completed", "run_aborted")

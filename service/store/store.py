@@ -19,8 +19,8 @@ from service.core.records.run_events import ComputedOn, JobFinished, RunStarted
 from service.core.run.state import Lane
 from service.core.words import storable
 from service.store import jobs as queue
-from service.store.access import close_to_others, require_access
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
+from service.store.data_folder import close_to_others, require_access, require_own_mount
 from service.store.database.changes import Changes, Channel, HeardChanges, PolledChanges
 from service.store.database.database import PATIENCE_S, Database
 from service.store.database.engine import DATABASE_NAME, LOOK, RESTORE, database_path
@@ -28,7 +28,6 @@ from service.store.database.opening import open_database, require_database
 from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Ages, Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.events import append, read_events, to_event
-from service.store.mounts import require_own_mount
 from service.store.objects.reading import SpoolReader
 from service.store.records import (
     EVERY_JOB,

@@ -11,9 +11,9 @@ from sqlalchemy import text
 
 from service.people.person import PinRefusedError
 from service.people.sessions import People
-from service.store.backup.backup import BackupOptions, back_up
-from service.store.backup.restore import restore
+from service.store.backup import BackupOptions, back_up
 from service.store.records import SITE
+from service.store.restoring import restore
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of
 from tests.support.record.office import Office

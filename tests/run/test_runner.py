@@ -10,8 +10,8 @@ import pytest
 from service.core.errors import ConfigurationError, StoreError
 from service.core.records.run_events import DeviceOpened, SessionStarted, ViewpointCaptured
 from service.run_start import recorded_rig, recorded_run
-from service.store.journal.rebuild import rebuild
 from service.store.records import Checkpoint, LeaseHeldError, RecordDamagedError
+from service.store.restoring import rebuild
 from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -19,11 +19,11 @@ from service.cli.main import app
 from service.core.errors import StoreError
 from service.core.records.events import LeftoversRemoved
 from service.people.sessions import People
-from service.store.backup.backup import BackupOptions, back_up
-from service.store.backup.restore import restore
+from service.store.backup import BackupOptions, back_up
 from service.store.database.engine import database_path, open_read_only
 from service.store.durable_effects import DurableFiles
 from service.store.records import SITE, SigningKeyError
+from service.store.restoring import restore
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -120,7 +120,7 @@ def test_a_folder_of_an_earlier_version_is_closed_and_the_log_says_so(
         path.chmod(0o755 if path.is_dir() else 0o444 if "artefacts" in path.parts else 0o644)
     with caplog.at_level(logging.WARNING), Store.open(data):
         assert open_to_others(data) == []
-    (told,) = [record.message for record in caplog.records if "service.store.access" in record.name]
+    (told,) = [record.message for record in caplog.records if "service.store.data_folder" in record.name]
     assert "for its owner alone now" in told
     assert "other accounts of this machine could read it" in told
     assert verify(data).ok

@@ -16,11 +16,10 @@ from service.cli.main import app
 from service.core.errors import StoreError
 from service.core.records.events import DataRestored
 from service.core.records.run_events import ViewpointCaptured
-from service.store.backup.backup import BackupOptions, back_up
-from service.store.backup.folder import BackupFolder
-from service.store.backup.restore import restore
+from service.store.backup import BackupFolder, BackupOptions, back_up
 from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.records import SITE
+from service.store.restoring import restore
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify

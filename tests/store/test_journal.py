@@ -21,11 +21,19 @@ from service.core.records.run_events import OperatorAction
 from service.store.database.engine import DATABASE_NAME, database_path
 from service.store.database.tables import metadata
 from service.store.durable_effects import DurableFiles, SystemClock
-from service.store.journal import changes
-from service.store.journal.journal import read_tail
-from service.store.journal.lines import NAME, Ending, JournalLine, read_lines
-from service.store.journal.rebuild import RebuildReport, rebuild
+from service.store.journal import (
+    DERIVED,
+    KEPT,
+    NAME,
+    PRESENT_STATE,
+    STATED_ELSEWHERE,
+    Ending,
+    JournalLine,
+    read_lines,
+    read_tail,
+)
 from service.store.records import SITE, NewJob, RecordDamagedError
+from service.store.restoring import RebuildReport, rebuild
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.second_place import JournalCopy, SecondPlace, journal_copy
 from service.store.signatures.signing import checkpoint
@@ -104,7 +112,7 @@ def test_every_row_is_in_the_journal_before_it_is_committed(tmp_path: Path) -> N
 
 
 def test_every_table_is_kept_made_again_or_of_the_moment() -> None:
-    named = {*changes.KEPT, *changes.DERIVED, *changes.PRESENT_STATE, *changes.STATED_ELSEWHERE}
+    named = {*KEPT, *DERIVED, *PRESENT_STATE, *STATED_ELSEWHERE}
     assert named == set(metadata.tables)
 
 
@@ -208,14 +216,14 @@ def test_a_rebuilt_database_holds_every_row_of_the_old_one(tmp_path: Path) -> No
         store.finish_job(job, measures={"rms_px": 1.0}, duration_s=1.0)
         store.claim_job("worker", 10.0)
         checkpoint(store, run)
-    before = {name: rows(data, f"SELECT * FROM {name} ORDER BY 1, 2, 3") for name in (*changes.KEPT, "heads")}
+    before = {name: rows(data, f"SELECT * FROM {name} ORDER BY 1, 2, 3") for name in (*KEPT, "heads")}
     index = rows(data, "SELECT * FROM event_index ORDER BY position")
     database_path(data).unlink()
     report = rebuild(data, actor=ada)
     kept = (data / "orthocapture.sqlite").stat()
     assert (report.made, report.why, report.lost, kept.st_size > 0) == ("database", "the database is gone", (), True)
     tamper(data, "DELETE FROM events WHERE kind = 'record_rebuilt'")  # what came since
-    after = {name: rows(data, f"SELECT * FROM {name} ORDER BY 1, 2, 3") for name in changes.KEPT}
+    after = {name: rows(data, f"SELECT * FROM {name} ORDER BY 1, 2, 3") for name in KEPT}
     for name in ("runs", "artefacts", "timestamps", "accounts", "invitations"):
         assert after[name] == before[name], name
     assert [row for row in after["events"] if row in before["events"]] == before["events"]

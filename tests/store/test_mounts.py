@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.store import mounts
+from service.store import data_folder
 from service.store.store import Store
 from tests.support.rig.rig import orthocapture
 
@@ -37,7 +37,7 @@ def test_a_folder_that_other_machines_can_mount_is_refused_for_writing(
 ) -> None:
     share = tmp_path / "a share"
     share.mkdir()
-    monkeypatch.setattr(mounts, "MOUNT_TABLE", table(tmp_path, kind, share))
+    monkeypatch.setattr(data_folder, "MOUNT_TABLE", table(tmp_path, kind, share))
     with pytest.raises(StoreError, match=rf"other machines can mount too \({kind}\)") as refused:
         Store.open(share / "runs")
     assert "--allow-mount" in str(refused.value)
@@ -50,16 +50,16 @@ def test_a_folder_that_other_machines_can_mount_is_refused_for_writing(
 def test_local_disks_encrypted_ones_and_containers_pass(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(mounts, "MOUNT_TABLE", table(tmp_path, kind, tmp_path))
+    monkeypatch.setattr(data_folder, "MOUNT_TABLE", table(tmp_path, kind, tmp_path))
     with Store.open(tmp_path / "runs"):
         pass
 
 
 def test_without_a_table_of_mounts_the_probe_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mounts, "MOUNT_TABLE", tmp_path / "there is none")
+    monkeypatch.setattr(data_folder, "MOUNT_TABLE", tmp_path / "there is none")
     with Store.open(tmp_path / "runs"):
         pass
-    assert mounts.file_system(tmp_path) == ""
+    assert data_folder.file_system(tmp_path) == ""
 
 
 @pytest.mark.parametrize(
@@ -79,26 +79,26 @@ def test_a_file_system_whose_locks_fail_or_exclude_nobody_is_refused(
 
     monkeypatch.setattr(fcntl, "fcntl", lock)
     with pytest.raises(StoreError, match=refusal):
-        mounts.require_own_mount(tmp_path)
+        data_folder.require_own_mount(tmp_path)
 
 
 @pytest.mark.slow
 def test_who_knows_better_allows_it_for_a_command_and_what_it_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mounts, "MOUNT_TABLE", table(tmp_path, "nfs4", tmp_path))
-    monkeypatch.setenv(mounts.ALLOW, "1")
+    monkeypatch.setattr(data_folder, "MOUNT_TABLE", table(tmp_path, "nfs4", tmp_path))
+    monkeypatch.setenv(data_folder.ALLOW, "1")
     with Store.open(tmp_path / "runs"):
         pass
-    monkeypatch.delenv(mounts.ALLOW)
+    monkeypatch.delenv(data_folder.ALLOW)
     answer = orthocapture("--allow-mount", "runs", "--data", str(tmp_path / "runs"), "--json")
     assert answer.returncode == 0, answer.stderr
     assert json.loads(answer.stdout) is not None
-    assert mounts.ALLOW not in os.environ
+    assert data_folder.ALLOW not in os.environ
 
 
 def test_doctor_says_so_and_counts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mounts, "MOUNT_TABLE", table(tmp_path, "nfs4", tmp_path))
+    monkeypatch.setattr(data_folder, "MOUNT_TABLE", table(tmp_path, "nfs4", tmp_path))
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: bench\nsimulated: true\ndevices: {}\n")
     answer = CliRunner().invoke(app, ["doctor", "--rig", str(rig), "--data", str(tmp_path / "runs")])

@@ -21,14 +21,21 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from sqlalchemy.util import LRUCache
 
 from service.core.errors import StoreError
-from service.store.access import file_mode, open_new, require_access
+from service.store.data_folder import file_mode, open_new, require_access
 from service.store.database import new_schema
 from service.store.database.database import PATIENCE_S, Database
 from service.store.database.revisions import REVISIONS, migrate, refuse_foreign, refuse_newer, revision_of
 from service.store.durable_effects import Files
-from service.store.journal import changes
-from service.store.journal.journal import REBUILD, Journal, Tail
-from service.store.journal.lines import RowImage
+from service.store.journal import (
+    REBUILD,
+    Journal,
+    RowImage,
+    Tail,
+    changed_rows,
+    every_row,
+    forget_changes,
+    watch_changes,
+)
 from service.store.records import RecordDamagedError, StoreVersionError
 
 DATABASE_NAME = "orthocapture.sqlite"
@@ -130,7 +137,7 @@ class SqliteDatabase(Database):
             raw = self._watched(plain)
             with self._begun(connection) as transaction:
                 if raw is not None:
-                    changes.forget(raw)
+                    forget_changes(raw)
                 yield connection
                 self.require_in_place()
                 if raw is None:
@@ -145,12 +152,12 @@ class SqliteDatabase(Database):
         if self._journal is None:
             return None
         if not connection.info.get("watched"):
-            connection.info["watched"] = changes.watch(raw)
+            connection.info["watched"] = watch_changes(raw)
         return raw if connection.info["watched"] else None
 
     def _commit(self, raw: sqlite3.Connection, transaction: RootTransaction) -> None:
         """Write the changes to the journal, then commit them, then say in the journal that this was done."""
-        rows = changes.changed_rows(raw)
+        rows = changed_rows(raw)
         held = self._require_record(signs=any(row.table == "checkpoints" for row in rows))
         line = self._write_first(raw, rows, held) if rows else None
         try:
@@ -176,7 +183,7 @@ class SqliteDatabase(Database):
         else:
             (events,) = raw.execute("SELECT count(*) FROM events").fetchone()
             earlier = events - sum(row.table == "events" for row in rows)
-            line = self._journal.begin(changes.every_row(raw), earlier)
+            line = self._journal.begin(every_row(raw), earlier)
         raw.execute(f"PRAGMA user_version = {line.number}")
         return line
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 from service.core.errors import ConfigurationError, IntegrityError, StoreError
 from service.core.units import bytes_of_gigabytes
-from service.store.access import folder_mode, make_folder
 from service.store.artefacts import ArtefactFiles, hash_file, relative_path
-from service.store.data_folder import site_of
+from service.store.data_folder import folder_mode, make_folder, site_of
 from service.store.objects.interface import ObjectStoreError
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.core.errors import ConfigurationError, IntegrityError, StoreError
-from service.store.access import file_mode
 from service.store.artefacts import Meter
+from service.store.data_folder import file_mode
 from service.store.durable_effects import Clock
 from service.store.objects.interface import ObjectStoreAwayError, ObjectStoreError, StoredObject
 from service.store.objects.signed_requests import Answer, SignedRequests, StoreKeys

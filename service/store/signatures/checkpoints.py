@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from sqlalchemy import Connection, Row, bindparam, insert, select
 
-from service.store.access import KEYS
+from service.store.data_folder import KEYS
 from service.store.database.tables import artefacts, checkpoints, events, timestamps
 from service.store.durable_effects import Files
 from service.store.events import canonical, parse_canonical

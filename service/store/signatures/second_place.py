@@ -17,8 +17,8 @@ from typing import Protocol, Self
 from service.core.errors import IntegrityError, StoreError
 from service.core.words import time_here
 from service.store.durable_effects import Clock, DurableFiles, Files, Signal, utc_text
-from service.store.journal.journal import Tail, read_tail
-from service.store.journal.lines import NAME as JOURNAL_NAME
+from service.store.journal import NAME as JOURNAL_NAME
+from service.store.journal import Tail, read_tail
 from service.store.signatures.log import NAME, copying_alone, unreadable
 from service.store.verification.chain_checks import Fault
 

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import SignerNamed
-from service.store.access import file_mode, open_new
+from service.store.data_folder import file_mode, open_new
 from service.store.database.database import is_postgres
 from service.store.database.tables import event_index, events
 from service.store.records import SITE, SignsElsewhereError

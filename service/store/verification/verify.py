@@ -17,7 +17,6 @@ from service.store.database.opening import open_read_only
 from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
-from service.store.journal.findings import journal_findings
 from service.store.objects.anchored import UnreadAnchors, read_anchors
 from service.store.objects.elsewhere import files_elsewhere
 from service.store.records import SITE, Artefact, RunRow, UnknownRunError
@@ -49,6 +48,7 @@ from service.store.verification.file_checks import (
     unlisted_files,
     unread_files,
 )
+from service.store.verification.journal_checks import journal_findings
 from service.store.verification.people_checks import people_faults
 
 

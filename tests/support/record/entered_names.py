@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.people.person import AccountError
 from service.people.sessions import People
-from service.store.backup.backup import BackupOptions, back_up
-from service.store.journal.lines import NAME as JOURNAL_NAME
+from service.store.backup import BackupOptions, back_up
+from service.store.journal import NAME as JOURNAL_NAME
 from service.store.records import SITE, NewJob
 from service.store.store import Store
 from simulators.sony_camera.exif import PLATE

@@ -12,9 +12,7 @@ from service.store.database.engine import database_path
 from service.store.database.tables import artefacts
 from service.store.durable_effects import DurableFiles
 from service.store.events import event_sha256, parse_canonical
-from service.store.journal.changes import every_row
-from service.store.journal.journal import Journal
-from service.store.journal.lines import NAME
+from service.store.journal import NAME, Journal, every_row
 from tests.support.record.outsider import INDEX_AGAIN, is_postgres, rows, tamper
 
 _EVENT: tuple[str, ...] = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256", "payload", "sha256")

@@ -18,9 +18,7 @@ from service.store.artefacts import record_sha256
 from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
 from service.store.events import ROOT, canonical, event_sha256, parse_canonical
-from service.store.journal.changes import every_row
-from service.store.journal.journal import Journal
-from service.store.journal.lines import FIRST, JournalLine, LineFields, line_bytes, read_lines
+from service.store.journal import FIRST, Journal, JournalLine, LineFields, every_row, line_bytes, read_lines
 from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import RowsDigest, key_fingerprint, public_bytes
 from service.store.signatures.checkpoints import statement as signed_text

@@ -17,9 +17,9 @@ from unittest.mock import patch
 from sqlalchemy import Connection
 
 from service.core.errors import OrthocaptureError
+from service.store import journal as journal_lines
 from service.store.database import engine as database
 from service.store.database.engine import database_path
-from service.store.journal import lines as journal_lines
 from service.store.signatures import log as signature_log
 from service.store.signatures.log import LogLine
 from service.store.verification import chain_checks as audit_checks

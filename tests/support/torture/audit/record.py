@@ -20,7 +20,7 @@ from service.people.sessions import People
 from service.rig import load_rig
 from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles, SystemClock
-from service.store.journal.lines import NAME as JOURNAL_NAME
+from service.store.journal import NAME as JOURNAL_NAME
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.log import NAME
 from service.store.signatures.second_place import SecondPlace, journal_copy

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from service.store.journal.lines import parse_mark
+from service.store.journal import parse_mark
 from tests.support.torture.audit import outcome
 from tests.support.torture.audit.outcome import Verdict, verdict
 from tests.support.torture.audit.record import Record, State, put, put_back

@@ -13,8 +13,20 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from service.store.database.engine import DATABASE_NAME
-from service.store.journal import changes
-from service.store.journal.lines import FIRST, NAME, Ending, JournalLine, Mark, RowImage, Value, read_lines
+from service.store.journal import (
+    FIRST,
+    NAME,
+    Ending,
+    JournalLine,
+    Mark,
+    RowImage,
+    Value,
+    every_row,
+    is_known,
+    key_of,
+    read_lines,
+    row_of_key,
+)
 from service.store.records import SITE
 from service.store.verification.chain_checks import Fault
 
@@ -77,7 +89,7 @@ class _Chain:
             return 0
         elif not follows and self._number not in self.problems:
             self._doubtful = number
-        if number not in self.problems and not all(map(changes.is_known, line.rows)):
+        if number not in self.problems and not all(map(is_known, line.rows)):
             self.problems[number] = "it has a row that no version writes: its text was altered"
         self._number, self._sha256 = number, line.sha256
         return number
@@ -207,22 +219,22 @@ def _differences(
     for row in rows:
         if not _is_of(row, wanted):
             continue
-        key = changes.key_of(row)
+        key = key_of(row)
         if row.gone:
             expected.pop(key, None)
         else:
             expected[key] = _written(row)
     told: Counter[str] = Counter()
-    for row in changes.every_row(connection):
+    for row in every_row(connection):
         if not _is_of(row, wanted):
             continue
-        written = expected.pop(changes.key_of(row), None)
+        written = expected.pop(key_of(row), None)
         if written is None:
             yield from _fault(told, row, "is not in the journal: it was put into the database past it")
         elif written.digest != _digest(row, written.columns):
             yield from _fault(told, row, "is not as it is in the journal: it was altered")
     for key in expected:
-        row = changes.row_of_key(*key)
+        row = row_of_key(*key)
         yield from _fault(told, row, "is in the journal and no longer in the database: it was removed")
     for table, number in told.items():
         if number > _MOST_OF_A_TABLE:

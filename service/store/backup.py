@@ -1,38 +1,206 @@
-"""Back up a data folder while it is in use: the database, its journal, the log of signatures, and new files.
+"""Backs up a data folder while it is in use, into a folder of backups with a marker file, states and a lock.
 
-The database is copied first, in one consistent state, with SQLite's backup interface; every file named in that state
-is then already on disk, and so is every line of the journal up to the one that this state holds. What a run adds
-meanwhile belongs to the next backup.
+BACKUP/orthocapture-backup.json   marks the folder
+BACKUP/artefacts/ab/abcd…         the files of all states by hash, each written once
+BACKUP/states/TIME/               one backup: orthocapture.sqlite, journal.jsonl, signatures.jsonl, state.json,
+                                  optionally keys/
+BACKUP/states/TIME.part           an unfinished backup, which is never used
+
+A state gets its name by one rename, after everything in it was written and read back. The database is copied first,
+in one consistent state, with SQLite's backup interface; every file named in that state is then already on disk, and
+so is every line of the journal up to the one that this state holds. What a run adds meanwhile belongs to the next
+backup.
 """
 
 from __future__ import annotations
 
+import fcntl
+import json
 import shutil
 import socket
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
 from service.core.errors import IntegrityError, StoreError
+from service.core.records.base import Record
 from service.core.units import gigabytes
-from service.store.access import KEYS, PEPPER
-from service.store.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
-from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, copy_keys, folder_errors
+from service.store.artefacts import TEMPORARY, ArtefactFiles, chunks_of, hash_file, relative_path
+from service.store.data_folder import KEYS, PEPPER, close_to_others
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.opening import require_sqlite
 from service.store.database.tables import artefacts, event_index, heads, runs
-from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
-from service.store.journal.lines import NAME as JOURNAL_NAME
-from service.store.journal.lines import first_lines
+from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock, utc_text
+from service.store.journal import NAME as JOURNAL_NAME
+from service.store.journal import first_lines
 from service.store.objects.reading import SpoolReader
 from service.store.signatures.checkpoints import KeyFolder, read_every_checkpoint
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
 from service.store.verification import verify as audit
+
+MARKER = "orthocapture-backup.json"
+STATES = "states"
+STATE_FILE = "state.json"
+PART = ".part"
+_SAYS = {"format": 1, "purpose": "backups of one orthocapture data folder"}
+
+
+class BackupState(Record):
+    """The content of one backup; written last."""
+
+    format: Literal[1] = 1
+    at_utc: str
+    host: str
+    data_folder: str  # its path on that host
+    database_sha256: str
+    signatures_sha256: str  # "" if nothing was signed yet
+    journal_sha256: str = ""  # "" if there was no journal yet
+    artefacts: int
+    artefact_bytes: int
+    heads: dict[str, tuple[int, str]]  # chain → number and hash of its last event
+    root_sha256: str  # root hash of the oldest chain, which identifies the data folder
+    with_keys: bool
+    faults: tuple[str, ...]  # faults of the data folder itself when it was copied; () if it verified
+
+
+def copy_keys(source: Path, target: Path, files: Files, *, only: Sequence[str] | None = None) -> None:
+    """Copy the files of a folder of keys, or `only` some, durably into a new one that is its owner's alone."""
+    names = sorted(path.name for path in source.iterdir() if path.is_file()) if only is None else only
+    files.make_directory(target, private=True)
+    for name in names:
+        files.write(target / name, [(source / name).read_bytes()], private=True)
+        files.sync_file(target / name)
+    files.sync_directory(target)
+
+
+@contextmanager
+def folder_errors(what: str) -> Generator[None]:
+    """Turn an OSError into a StoreError that begins with `what`."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"{what}: {error.strerror or error}",
+            where=str(error.filename or ""),
+            remedy="Check that the disk or share is there, its free space and permissions, then repeat the command",
+        ) from error
+
+
+class BackupFolder:
+    """The backups of one data folder."""
+
+    def __init__(self, folder: Path, files: Files, ids: IdSource) -> None:
+        self.folder = folder
+        self.files = files
+        self.artefacts = ArtefactFiles(folder / "artefacts", files, ids)
+
+    def prepare(self) -> None:
+        """Make the folder, or check that it is a folder of backups. Raises StoreError."""
+        with folder_errors("the folder for backups cannot be made"):
+            for directory in (*reversed(self.folder.absolute().parents), self.folder.absolute()):
+                if not directory.exists():
+                    self.files.make_directory(directory, private=directory == self.folder.absolute())
+                    self.files.sync_directory(directory.parent)
+            close_to_others(self.folder, MARKER)
+            if not (self.folder / MARKER).exists():
+                self._mark()
+            self.require()
+            self.artefacts.prepare()
+            self.files.make_directory(self.folder / STATES)
+            self.files.sync_directory(self.folder)
+
+    def _mark(self) -> None:
+        part = self.folder / (MARKER + PART)
+        if any(path != part for path in self.folder.iterdir()):
+            raise StoreError(
+                "this folder holds something other than backups",
+                where=str(self.folder),
+                remedy="Name an empty folder, or one that does not exist yet",
+            )
+        self.files.remove(part)
+        self.files.write(part, [json.dumps(_SAYS).encode()])
+        self.files.sync_file(part)
+        self.files.rename(part, self.folder / MARKER)
+        self.files.sync_directory(self.folder)
+
+    def require(self) -> None:
+        """Raise StoreError unless this is a folder of backups in a known format."""
+        try:
+            known = json.loads((self.folder / MARKER).read_bytes()) == _SAYS
+        except (OSError, ValueError):
+            known = False
+        if not known:
+            raise StoreError(
+                "this is not a folder of orthocapture backups, or it is of a newer version",
+                where=str(self.folder),
+                remedy="Name the folder that `orthocapture store backup` has written",
+            )
+
+    @contextmanager
+    def locked(self) -> Generator[None]:
+        """Hold the lock that allows one backup at a time. Raises StoreError if another is running."""
+        with (self.folder / MARKER).open("rb") as marker:
+            try:
+                fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StoreError(
+                    "another backup into this folder is running",
+                    where=str(self.folder),
+                    remedy="Wait until it has ended",
+                ) from error
+            yield
+
+    def states(self) -> list[str]:
+        """Return names of the complete backups, oldest first."""
+        found = (self.folder / STATES).glob(f"*/{STATE_FILE}")
+        return sorted(path.parent.name for path in found if path.parent.suffix != PART)
+
+    def path(self, name: str) -> Path:
+        """Return the folder of a state, which need not exist."""
+        return self.folder / STATES / name
+
+    def read(self, name: str) -> BackupState:
+        """Return the record of a state.
+
+        Raises StoreError if there is no such state, IntegrityError if it is unreadable.
+        """
+        if name not in self.states():
+            raise StoreError(
+                f"there is no backup {name!r} here" if name else "there is no complete backup here",
+                where=str(self.folder),
+                remedy=f"There are: {', '.join(self.states()) or 'none; repeat an unfinished backup'}",
+            )
+        path = self.path(name) / STATE_FILE
+        try:
+            return BackupState.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError) as error:
+            raise IntegrityError(
+                "the record of this backup cannot be read", where=str(path), remedy="Use an older backup"
+            ) from error
+
+    def discard(self, path: Path) -> None:
+        """Delete a state; it is renamed first, so that a partly deleted one is never mistaken for complete."""
+        if path.suffix != PART:
+            part = path.with_name(path.name + PART)
+            self.files.rename(path, part)
+            self.files.sync_directory(path.parent)
+            path = part
+        shutil.rmtree(path)
+
+    def discard_unfinished(self) -> None:
+        """Delete unfinished states and partial files of earlier backups; complete copies stay and are used."""
+        for path in (self.folder / STATES).glob(f"*{PART}"):
+            self.discard(path)
+        for path in (self.artefacts.folder / TEMPORARY).glob(f"*{PART}"):
+            self.files.remove(path)
+
 
 Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
 _SPARE_BYTES = 64 << 20  # must be free beyond what is copied

@@ -1,1 +1,0 @@
-"""The journal: every committed change of the record, written to a file of its own before it counts."""
