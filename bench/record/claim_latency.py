@@ -23,7 +23,7 @@ from typing import Any
 from sqlalchemy import text
 
 from bench.machine import RESULTS, commit, machine
-from service.store.database.changes import Changes, PolledChanges
+from service.store.database.database import Changes, PolledChanges
 from service.store.durable_effects import SystemClock
 from service.store.jobs import to_job
 from service.store.records import NewJob

@@ -25,7 +25,7 @@ from service.cli.options import OperatorOption, PasswordOption, acting_name, act
 from service.core.units import gigabytes
 from service.core.words import counted
 from service.store.backup import BackupOptions, BackupReport, back_up
-from service.store.database.preparing import prepare
+from service.store.database.postgres import prepare
 from service.store.disk_space import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.moving import MoveReport, copy_record, move_run
 from service.store.records import SITE

@@ -50,7 +50,7 @@ from service.runner.pedal import Pedal
 from service.runner.software import software_versions
 from service.runner.upkeep import PASSING, ClockWatch, DiskWatch, RecordTrouble, Seal, short_collections
 from service.steps.context import Devices
-from service.store.database.changes import Changes
+from service.store.database.database import Changes
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store

@@ -18,7 +18,7 @@ from service.core.errors import IntegrityError, StoreError
 from service.core.records.base import ArtefactRef
 from service.core.records.events import PAYLOAD, Event, Payload, RunMoved
 from service.core.words import storable, storable_data
-from service.store.database.changes import notify
+from service.store.database.database import notify
 from service.store.database.tables import event_facets, event_index, events, heads
 from service.store.durable_effects import Clock, utc_text
 from service.store.event_index import OF_FACET, EventToIndex, index_events

@@ -13,8 +13,7 @@ from service.core.records.events import Event
 from service.core.records.run_events import JobEnqueued, JobFailed, JobFinished, StepNote
 from service.core.run.state import EARLY, Lane
 from service.core.words import storable
-from service.store.database.changes import notify
-from service.store.database.database import lease_now_s
+from service.store.database.database import lease_now_s, notify
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.events import append, canonical, moved_runs, parse_canonical

@@ -21,8 +21,7 @@ from service.core.words import storable
 from service.store import jobs as queue
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
 from service.store.data_folder import close_to_others, require_access, require_own_mount
-from service.store.database.changes import Changes, Channel, HeardChanges, PolledChanges
-from service.store.database.database import PATIENCE_S, Database
+from service.store.database.database import PATIENCE_S, Changes, Channel, Database, HeardChanges, PolledChanges
 from service.store.database.engine import DATABASE_NAME, LOOK, RESTORE, database_path
 from service.store.database.opening import open_database, require_database
 from service.store.database.tables import artefacts, events, heads, runs

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from service.core.records.run_events import StepNote
-from service.store.database.changes import Channel, HeardChanges, PolledChanges
+from service.store.database.database import Channel, HeardChanges, PolledChanges
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.processes.postgres import Cluster

@@ -22,7 +22,7 @@ from service.cli.main import app
 from service.core.errors import ComputeError, StoreError
 from service.core.records.events import RecordCopied
 from service.core.records.run_events import StepNote
-from service.store.database.postgres_schema import EVIDENCE
+from service.store.database.postgres import EVIDENCE
 from service.store.database.tables import artefacts, event_facets, events, jobs, metadata
 from service.store.durable_effects import Clock
 from service.store.records import SITE, LeaseHeldError, NewJob, StoreVersionError

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.records.run_events import StepNote
-from service.store.database.revisions import REVISIONS
+from service.store.database.database import REVISIONS
 from service.store.records import StoreVersionError
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -26,7 +26,8 @@ from sqlalchemy import create_engine, text
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.run_events import ActionRefused, JobEnqueued, StepNote
 from service.store.database import engine as database
-from service.store.database import new_schema, revisions
+from service.store.database import new_schema
+from service.store.database.database import REVISIONS, migrate
 from service.store.database.engine import database_path
 from service.store.database.tables import metadata
 from service.store.events import ROOT, canonical, canonical_parsed, event_sha256, parse_canonical
@@ -220,10 +221,10 @@ def test_migrations_make_the_tables_of_the_metadata(store: Store) -> None:
 def test_a_new_database_is_what_the_migrations_make() -> None:
     migrated = create_engine("sqlite://")
     with migrated.begin() as connection:
-        revisions.migrate(connection)
+        migrate(connection)
         assert database.read_schema(connection) == database.fresh_schema()
         made_by = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one()
-        assert made_by == revisions.REVISIONS[-1]
+        assert made_by == REVISIONS[-1]
     migrated.dispose()
     statements = migrated_statements()
     assert statements == new_schema.STATEMENTS
@@ -241,7 +242,7 @@ def test_the_known_revisions_are_those_of_the_migrations() -> None:
     config.set_main_option("script_location", "service.store.database:migrations")
     config.set_main_option("path_separator", "os")
     scripts = ScriptDirectory.from_config(config).walk_revisions()
-    assert tuple(reversed([script.revision for script in scripts])) == revisions.REVISIONS
+    assert tuple(reversed([script.revision for script in scripts])) == REVISIONS
 
 
 def test_newer_database_is_refused_unchanged(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from service.audit.filters import EventFilter
 from service.audit.record.search import events_page
 from service.cli.main import app
 from service.core.records.events import RecordCopied
-from service.store.database.revisions import REVISIONS
+from service.store.database.database import REVISIONS
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -26,7 +26,7 @@ from service.core.records.run_events import (
     ViewpointCaptured,
 )
 from service.dataset.export_folder import check_folder
-from service.store.database.postgres_schema import EVIDENCE
+from service.store.database.postgres import EVIDENCE
 from service.store.objects.spool import spool_level
 from service.store.store import Store
 from tests.support.processes.cluster import end_tree

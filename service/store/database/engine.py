@@ -23,8 +23,15 @@ from sqlalchemy.util import LRUCache
 from service.core.errors import StoreError
 from service.store.data_folder import file_mode, open_new, require_access
 from service.store.database import new_schema
-from service.store.database.database import PATIENCE_S, Database
-from service.store.database.revisions import REVISIONS, migrate, refuse_foreign, refuse_newer, revision_of
+from service.store.database.database import (
+    PATIENCE_S,
+    REVISIONS,
+    Database,
+    migrate,
+    refuse_foreign,
+    refuse_newer,
+    revision_of,
+)
 from service.store.durable_effects import Files
 from service.store.journal import (
     REBUILD,

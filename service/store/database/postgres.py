@@ -1,4 +1,4 @@
-"""The PostgreSQL database of a site: opening, preparing, and the two kinds of transaction.
+"""The PostgreSQL database of a site: its tables and rights, opening, preparing, and the two kinds of transaction.
 
 Two roles: the owner of the tables prepares and upgrades them and is used for nothing else; the role of the program
 may read and insert evidence, and change only what is of the moment. Writers wait for one another (an advisory lock
@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Engine, TextClause, create_engine, event, text
@@ -19,11 +20,96 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlch
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from service.core.errors import ConfigurationError, StoreError
-from service.store.database import postgres_schema
-from service.store.database.database import PATIENCE_S, Database
-from service.store.database.revisions import REVISIONS, refuse_newer, revision_of
-from service.store.durable_effects import Files
+from service.store.database.database import (
+    PATIENCE_S,
+    REVISIONS,
+    Database,
+    migrate,
+    postgres_triggers,
+    refuse_foreign,
+    refuse_newer,
+    revision_of,
+)
+from service.store.database.tables import metadata
+from service.store.durable_effects import DurableFiles, Files
 from service.store.records import StoreVersionError
+
+EVIDENCE = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index", "event_facets", "event_words")
+_ENDS = ("heads",)  # inserted and moved, never removed
+_OF_THE_MOMENT = ("jobs", "leases", "accounts", "invitations", "sessions", "control", "copies")
+_REFUSAL = """
+BEGIN
+  RAISE EXCEPTION '% is append-only: % refused', TG_TABLE_NAME, lower(TG_OP);
+END """
+_REFUSE = f"CREATE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS $${_REFUSAL}$$"
+_FURTHER = (
+    "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL PRIMARY KEY)",
+    "CREATE TABLE event_words (position BIGINT NOT NULL PRIMARY KEY, words TSVECTOR NOT NULL)",
+    "CREATE INDEX event_words_by_word ON event_words USING gin (words)",
+    # The order of signatures; SQLite counts rows by itself, under this name.
+    "ALTER TABLE checkpoints ADD COLUMN rowid BIGINT GENERATED ALWAYS AS IDENTITY",
+    # The row of a run holds the hash of its first event, which refers to the row.
+    "ALTER TABLE events ALTER CONSTRAINT events_run_id_fkey DEFERRABLE INITIALLY IMMEDIATE",
+    "ALTER TABLE heads ALTER CONSTRAINT heads_run_id_fkey DEFERRABLE INITIALLY IMMEDIATE",
+    _REFUSE.replace("%", "%%"),
+)
+# What these tables have beside the columns and constraints of service.store.database.tables.
+FURTHER_COLUMNS: Mapping[tuple[str, str], object] = {
+    ("alembic_version", "version_num"): ("character varying(32)", True),
+    ("checkpoints", "rowid"): ("bigint", True),
+    ("event_words", "position"): ("bigint", True),
+    ("event_words", "words"): ("tsvector", True),
+}
+FURTHER_CONSTRAINTS = {("alembic_version", "alembic_version_pkey"), ("event_words", "event_words_pkey")}
+_EVERY_ROW = 1 + 2 + 8 + 16  # of pg_trigger.tgtype: for each row, before, delete, update
+_EVERY_TRUNCATE = 2 + 32  # before, truncate
+
+
+def triggers() -> dict[tuple[str, str], object]:
+    """Return by table and name how each trigger is enabled, its type as in pg_trigger, and what it does."""
+    found: dict[tuple[str, str], object] = {}
+    for table in EVIDENCE:
+        found[table, f"{table}_append_only"] = ("O", _EVERY_ROW, _REFUSAL)
+        found[table, f"{table}_no_truncate"] = ("O", _EVERY_TRUNCATE, _REFUSAL)
+    return found
+
+
+def granted(table: str) -> tuple[str, ...]:
+    """Return what the program's role may do with a table."""
+    if table in EVIDENCE:
+        return ("SELECT", "INSERT")
+    if table in _ENDS:
+        return ("SELECT", "INSERT", "UPDATE")
+    return ("SELECT", "INSERT", "UPDATE", "DELETE") if table in _OF_THE_MOMENT else ("SELECT",)
+
+
+def make_tables(connection: Connection) -> None:
+    """Make all tables as their owner: the same that the migrations make of the tables of an earlier version."""
+    metadata.create_all(connection)
+    for statement in (*_FURTHER, *(made for table in EVIDENCE for made in postgres_triggers(table))):
+        connection.exec_driver_sql(statement)
+    connection.execute(text("INSERT INTO alembic_version VALUES (:revision)"), {"revision": REVISIONS[-1]})
+
+
+def grant_rights(connection: Connection, role: str) -> tuple[str, ...]:
+    """Grant a role the missing privileges, as the owner of the tables; return them, one text a table."""
+    done: list[str] = []
+    asked = text("SELECT has_table_privilege(:role, :table, :power)")
+    for table in ("alembic_version", *EVIDENCE, *_ENDS, *_OF_THE_MOMENT):
+        missing = [
+            power
+            for power in granted(table)
+            if not connection.execute(asked, {"role": role, "table": table, "power": power}).scalar_one()
+        ]
+        if missing:
+            connection.exec_driver_sql(f"GRANT {', '.join(missing)} ON {table} TO {_quoted(role)}")
+            done.append(f"{', '.join(missing)} on {table}")
+    return tuple(done)
+
+
+def _quoted(role: str) -> str:
+    return '"' + role.replace("%", "%%").replace('"', '""') + '"'
+
 
 _LOG = logging.getLogger(__name__)
 WRITERS = 0x6F727468  # the advisory lock that writers hold; any number that nobody else uses
@@ -237,7 +323,7 @@ def powers_over_evidence(connection: Connection) -> list[str]:
     found: list[str] = []
     if connection.execute(text("SELECT rolsuper FROM pg_roles WHERE rolname = current_user")).scalar_one():
         found.append("is a superuser")
-    for table in postgres_schema.EVIDENCE:
+    for table in EVIDENCE:
         owner = text("SELECT pg_has_role(relowner, 'USAGE') FROM pg_class WHERE oid = to_regclass(:name)")
         if connection.execute(owner, {"name": table}).scalar():
             found.append(f"owns the table {table}")
@@ -269,3 +355,49 @@ def _store_errors(where: str) -> Generator[None]:
 
 def _first_line(error: Any) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+_AS_OWNER = "Name the owner in the address, postgresql://OWNER@HOST/DATABASE; nothing was changed"
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """The result of preparing a database."""
+
+    before: str | None  # the revision before; None: it was empty
+    revision: str
+    granted: tuple[str, ...]  # the missing privileges, such as "SELECT, INSERT on events"
+
+
+def prepare(owner_url: str, role: str) -> Prepared:
+    """Make or upgrade the tables of a site as their owner, and grant the program's role its missing privileges.
+
+    All of it is one transaction, during which no program writes. An interruption leaves the database as it was.
+
+    Raises:
+        StoreVersionError: a newer version prepared the database, or it has tables that are not orthocapture's.
+        StoreError: it cannot be reached, or its tables belong to another role.
+    """
+    database = PostgresDatabase(engine_for(owner_url), DurableFiles())
+    try:
+        with database.preparing() as connection:
+            present = revision_of(connection)
+            refuse_newer(present, database.where)
+            if present is None:
+                refuse_foreign(connection, database.where, "Name an empty database; nothing was changed")
+                make_tables(connection)
+            else:
+                _require_owner(connection, database.where)
+                if present != REVISIONS[-1]:
+                    migrate(connection)
+            return Prepared(present, REVISIONS[-1], grant_rights(connection, role))
+    finally:
+        database.close()
+
+
+def _require_owner(connection: Connection, where: str) -> None:
+    asked = "SELECT pg_get_userbyid(relowner), current_user FROM pg_class WHERE oid = to_regclass('alembic_version')"
+    owner, user = connection.execute(text(asked)).one()
+    if owner != user:
+        what = f"the tables belong to the role {owner}, and this address names {user}"
+        raise StoreError(what, where=where, remedy=_AS_OWNER)

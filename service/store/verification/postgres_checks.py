@@ -17,7 +17,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.schema import ColumnCollectionConstraint
 
-from service.store.database import postgres_schema
+from service.store.database import postgres
 from service.store.database.tables import metadata
 from service.store.event_index import indexed_events, vector, words_of
 from service.store.verification.chain_checks import Fault
@@ -61,14 +61,14 @@ def schema_faults(connection: Connection) -> Iterator[Fault]:
         *_missing("constraint", _expected_constraints(), {(t, c) for t, c in connection.execute(_CONSTRAINTS)}),
         *_differences(
             "trigger",
-            postgres_schema.triggers(),
+            postgres.triggers(),
             {(t, n): (enabled, kind, source) for t, n, enabled, kind, source in connection.execute(_TRIGGERS)},
             ": the evidence could be changed",
         ),
     ):
         yield Fault(None, None, _WHERE, what)
     for table, grantee, privilege in connection.execute(_GRANTS):
-        if privilege not in postgres_schema.granted(table):
+        if privilege not in postgres.granted(table):
             what = f"the role {grantee} may {privilege} on {table}: this software never grants that"
             yield Fault(None, None, _WHERE, what)
 
@@ -80,11 +80,11 @@ def _expected_columns() -> dict[tuple[str, str], object]:
         for table in metadata.tables.values()
         for column in table.columns
     }
-    return of_metadata | dict(postgres_schema.FURTHER_COLUMNS)
+    return of_metadata | dict(postgres.FURTHER_COLUMNS)
 
 
 def _expected_constraints() -> set[tuple[str, str]]:
-    found: set[tuple[str, str]] = set(postgres_schema.FURTHER_CONSTRAINTS)
+    found: set[tuple[str, str]] = set(postgres.FURTHER_CONSTRAINTS)
     for table in metadata.tables.values():
         for constraint in table.constraints:
             columns = (

@@ -18,7 +18,7 @@ import psutil
 import psycopg
 from sqlalchemy.engine import make_url
 
-from service.store.database.preparing import prepare
+from service.store.database.postgres import prepare
 
 OWNER, ROLE, OTHER = "oc_owner", "oc_app", "postgres"
 _LIVED_WITH_ROOT = "nobody"  # initdb refuses root

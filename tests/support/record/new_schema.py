@@ -8,7 +8,8 @@ from pathlib import Path
 
 from sqlalchemy import create_engine, text
 
-from service.store.database import new_schema, revisions
+from service.store.database import new_schema
+from service.store.database.database import migrate
 
 _PIECE = re.compile(r"\S.{0,98}(?:\s|\Z)|\s")  # of a line of a statement, with the space at its end
 _HEAD = '''"""The statements that make a new database: what all migrations together make, without loading Alembic.
@@ -27,7 +28,7 @@ def migrated_statements() -> tuple[str, ...]:
     made = create_engine("sqlite://")
     try:
         with made.begin() as connection:
-            revisions.migrate(connection)
+            migrate(connection)
             schema = connection.execute(
                 text("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL ORDER BY rowid")
             )

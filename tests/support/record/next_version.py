@@ -24,7 +24,7 @@ _MIGRATION = f'''"""Add inspections, which are evidence, and where a run came fr
 import sqlalchemy as sa
 from alembic import op
 
-from service.store.database.revisions import refuse_changes
+from service.store.database.database import refuse_changes
 from service.store.database.tables import DOUBLE, INTEGER, TEXT
 
 revision = "{NEXT}"
@@ -65,8 +65,8 @@ runs.append_column(Column("origin", TEXT, nullable=False, server_default=""))
 """
 _ADDED = {
     "tables.py": _TABLES,
-    "revisions.py": f'REVISIONS = (*REVISIONS, "{NEXT}")\n',
-    "postgres_schema.py": 'EVIDENCE = (*EVIDENCE, "inspections")\n',
+    "database.py": f'REVISIONS = (*REVISIONS, "{NEXT}")\n',
+    "postgres.py": 'EVIDENCE = (*EVIDENCE, "inspections")\n',
     f"migrations/versions/{NEXT}_inspections.py": _MIGRATION,
 }
 _SEVERAL = """

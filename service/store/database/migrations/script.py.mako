@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 from alembic import op
 
-from service.store.database.revisions import refuse_changes
+from service.store.database.database import refuse_changes
 from service.store.database.tables import DOUBLE, INTEGER, TEXT
 
 revision = ${repr(up_revision)}
