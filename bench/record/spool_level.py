@@ -26,8 +26,7 @@ from bench.machine import RESULTS, commit, machine
 from service.store.data_folder import object_store_of
 from service.store.database.engine import database_path
 from service.store.durable_effects import utc_text
-from service.store.objects.copies import Waiting, last_position, read_waiting
-from service.store.objects.spool import CountedSpool, spool_level, write_counted
+from service.store.objects.spool import CountedSpool, Waiting, last_position, read_waiting, spool_level, write_counted
 from service.store.store import Store
 
 _A_RUN = 100  # artefacts of one run

@@ -45,8 +45,7 @@ from service.store.data_folder import object_store_of, why_unsafe
 from service.store.database.opening import has_database
 from service.store.disk_space import forecast_of
 from service.store.durable_effects import Clock, DurableFiles, SystemClock
-from service.store.objects.opening import open_objects
-from service.store.objects.probe import ProbeResult, probe
+from service.store.objects.opening import ProbeResult, open_objects, probe
 from service.store.objects.spool import SpoolLevel, spool_level
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store

@@ -18,13 +18,10 @@ from service.core.words import counted
 from service.logs.file_log import file_log
 from service.machine.resources import compute_in_background
 from service.store.data_folder import SITE_FILE, kept_to
-from service.store.objects.anchors import AnchorWriter
-from service.store.objects.copies import Waiting, read_waiting
-from service.store.objects.freeing import SpoolFile, free_spool, spool_files
-from service.store.objects.locked import LockedObjects
+from service.store.objects.anchors import AnchorWriter, LockedObjects
 from service.store.objects.opening import open_objects
 from service.store.objects.s3 import S3Objects
-from service.store.objects.spool import write_trouble
+from service.store.objects.spool import SpoolFile, Waiting, free_spool, read_waiting, spool_files, write_trouble
 from service.store.objects.upload import Uploader, alone
 from service.store.site import SiteFile, load_site
 from service.store.store import Store

@@ -26,7 +26,7 @@ from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds,
 from service.store.event_index import index_all
 from service.store.journal import NAME, Journal, apply_row, every_row, first_lines
 from service.store.journal import NAME as JOURNAL_NAME
-from service.store.objects.elsewhere import not_elsewhere
+from service.store.objects.reading import not_elsewhere
 from service.store.records import SITE
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.signing import checkpoint

@@ -17,11 +17,17 @@ from service.audit.overview.first_page import verified
 from service.audit.verify.verifications import verification_of
 from service.cli.main import app
 from service.store.durable_effects import SystemClock, utc_text
-from service.store.objects.anchor_forms import ROOTS, LineAnchor, RootAnchor, line_name, merkle_root
 from service.store.objects.anchored import read_anchors
-from service.store.objects.anchors import AnchorWriter
+from service.store.objects.anchors import (
+    ROOTS,
+    AnchorWriter,
+    LineAnchor,
+    LockedObjects,
+    RootAnchor,
+    line_name,
+    merkle_root,
+)
 from service.store.objects.interface import ObjectStoreError
-from service.store.objects.locked import LockedObjects
 from service.store.objects.s3 import S3Objects
 from service.store.objects.upload import Uploader
 from service.store.signatures.log import NAME as LOG

@@ -16,8 +16,8 @@ from service.audit.record.run import RecordedFiles
 from service.cli.main import app
 from service.core.errors import IntegrityError
 from service.store.backup import back_up
-from service.store.objects.freeing import free_spool, spool_files
 from service.store.objects.s3 import S3Objects
+from service.store.objects.spool import free_spool, spool_files
 from service.store.objects.upload import Uploader
 from service.store.restoring import rebuild, restore
 from service.store.site import SpoolSection

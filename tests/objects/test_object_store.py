@@ -14,8 +14,8 @@ from service.cli.main import app
 from service.core.errors import IntegrityError
 from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreAwayError, ObjectStoreError
-from service.store.objects.probe import probe
-from service.store.objects.signed_requests import StoreKeys
+from service.store.objects.opening import probe
+from service.store.objects.s3 import StoreKeys
 from tests.support.processes.object_store import Weed
 
 

@@ -12,11 +12,10 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.store.database.tables import copies
-from service.store.objects.copies import read_waiting
 from service.store.objects.interface import ObjectStoreAwayError
 from service.store.objects.opening import open_objects
 from service.store.objects.s3 import S3Objects
-from service.store.objects.spool import SpoolLevel, spool_level
+from service.store.objects.spool import SpoolLevel, read_waiting, spool_level
 from service.store.objects.upload import Uploader
 from service.store.records import NewArtefact
 from service.store.site import load_site

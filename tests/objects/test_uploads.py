@@ -16,9 +16,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.store.database.tables import copies
-from service.store.objects.copies import read_waiting
 from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
-from service.store.objects.spool import read_trouble
+from service.store.objects.spool import read_trouble, read_waiting
 from service.store.objects.upload import Uploader
 from service.store.store import Store
 from service.store.verification.verify import verify

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from service.core.errors import StoreError
 from service.store.data_folder import object_store_of
-from service.store.objects.anchor_forms import FOLDER
+from service.store.objects.anchors import FOLDER
 from service.store.verification.anchor_checks import ReadAnchors
 
 _AT_ONCE = 8
@@ -34,7 +34,7 @@ def read_anchors(data_dir: Path) -> ReadAnchors | UnreadAnchors | None:
     if section is None or section.lock_days is None:
         return None
     # Imported here: for sites only.
-    from service.store.objects.locked import LockedObjects  # noqa: PLC0415
+    from service.store.objects.anchors import LockedObjects  # noqa: PLC0415
     from service.store.objects.opening import open_objects  # noqa: PLC0415
 
     try:

@@ -17,17 +17,21 @@ from service.core.words import counted
 from service.store.artefacts import relative_path
 from service.store.durable_effects import utc_text
 from service.store.objects.anchors import AnchorWriter
-from service.store.objects.copies import (
+from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
+from service.store.objects.spool import (
+    CountedSpool,
     Recorded,
+    UploadTrouble,
     count_confirmed,
     is_confirmed,
     last_position,
     next_waiting,
+    read_counted,
     read_waiting,
     write_confirmed,
+    write_counted,
+    write_trouble,
 )
-from service.store.objects.interface import ObjectStore, ObjectStoreAwayError, ObjectStoreError
-from service.store.objects.spool import CountedSpool, UploadTrouble, read_counted, write_counted, write_trouble
 from service.store.store import Store
 
 _LOG = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from service.core.words import counted
-from service.store.objects.anchor_forms import (
+from service.store.objects.anchors import (
     ROOTS,
     LineAnchor,
     ListedVersion,

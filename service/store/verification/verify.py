@@ -18,7 +18,7 @@ from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
 from service.store.objects.anchored import UnreadAnchors, read_anchors
-from service.store.objects.elsewhere import files_elsewhere
+from service.store.objects.reading import files_elsewhere
 from service.store.records import SITE, Artefact, RunRow, UnknownRunError
 from service.store.runs import read_runs
 from service.store.signatures.log import NAME as LOG_NAME

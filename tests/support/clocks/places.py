@@ -68,15 +68,19 @@ PLACES = {
     "service/store/durable_effects.py": "life of a sign-in; the clocks themselves",
     "service/store/backup.py": _STAMP,
     "service/store/database/database.py": "by which clock leases are judged",
-    "service/store/objects/anchors.py": "until when an anchor is locked, and the day of a root",
-    "service/store/objects/locked.py": "times that the object store states",
+    "service/store/objects/anchors.py": (
+        "until when an anchor is locked, and the day of a root; times that the object store states"
+    ),
     "service/store/verification/anchor_checks.py": "age of signatures without an anchor, against a patience of hours",
-    "service/store/objects/copies.py": "how much was recorded in the last hour, which is shown",
-    "service/store/objects/spool.py": "since when no uploader has counted, which is shown",
-    "service/store/objects/freeing.py": "age of a file that may leave the spool; the object store has confirmed it",
-    "service/store/objects/probe.py": "until when a tried object is locked",
+    "service/store/objects/spool.py": (
+        "how much was recorded in the last hour, which is shown; "
+        "since when no uploader has counted, which is shown; "
+        "age of a file that may leave the spool; "
+        "the object store has confirmed it"
+    ),
+    "service/store/objects/opening.py": "until when a tried object is locked",
     "service/store/objects/reading.py": "which fetched copy was used last",
-    "service/store/objects/signed_requests.py": "time of a signed request, which the object store judges",
+    "service/store/objects/s3.py": "time of a signed request, which the object store judges",
     "service/store/objects/upload.py": _STAMP,
     "service/store/database/engine.py": _CHANGE,
     "service/store/database/migrations/versions/0001_evidence.py": _STAMP,

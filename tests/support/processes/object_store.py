@@ -17,8 +17,7 @@ import yaml
 
 from service.store.durable_effects import SystemClock
 from service.store.objects.interface import ObjectStoreError
-from service.store.objects.s3 import S3Objects
-from service.store.objects.signed_requests import SignedRequests, StoreKeys
+from service.store.objects.s3 import S3Objects, SignedRequests, StoreKeys
 from tests.support.record.outsider import write_site_file
 
 KEYS = StoreKeys("test-access", "test-secret")
