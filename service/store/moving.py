@@ -42,8 +42,7 @@ from service.store.records import SITE, NewArtefact
 from service.store.runs import defer_references, is_held
 from service.store.signatures.checkpoints import read_key_changes
 from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.signer import named_signer, this_signer
-from service.store.signatures.signing import checkpoint
+from service.store.signatures.signing import checkpoint, named_signer, this_signer
 from service.store.store import Store
 
 _AT_ONCE = 500  # rows

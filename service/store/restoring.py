@@ -32,7 +32,7 @@ from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification import verify as audit
-from service.store.verification.journal_checks import Survey, committed_rows, journal_findings, survey
+from service.store.verification.file_checks import Survey, committed_rows, journal_findings, survey
 from service.store.verification.verify import AuditReport
 
 Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)

@@ -45,7 +45,7 @@ SERVICE = {
     "service/machine/dask_cluster.py": "how long a scheduler has had no worker",
     "service/machine/dask_files.py": "how long a file has not come",
     "service/machine/schedulers.py": "rests between tries to reach a scheduler",
-    "service/store/objects/anchored.py": "when anchors were compared, of a folder, which has no clock",
+    "service/store/verification/anchor_checks.py": "when anchors were compared, of a folder, which has no clock",
     "service/store/database/postgres.py": "a server is waited for, by the host's clock",
     "service/store/database/engine.py": "SQLite waits for another process, by the host's clock",
     "service/store/signatures/log.py": "waits for another process that signs, by the host's clock",

@@ -17,7 +17,6 @@ from service.audit.overview.first_page import verified
 from service.audit.verify.verifications import verification_of
 from service.cli.main import app
 from service.store.durable_effects import SystemClock, utc_text
-from service.store.objects.anchored import read_anchors
 from service.store.objects.anchors import (
     ROOTS,
     AnchorWriter,
@@ -34,7 +33,7 @@ from service.store.signatures.log import NAME as LOG
 from service.store.signatures.log import read_log
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
-from service.store.verification.anchor_checks import ReadAnchors, RecordSide, compare
+from service.store.verification.anchor_checks import ReadAnchors, RecordSide, compare, read_anchors
 from service.store.verification.verify import AuditReport, verify
 from tests.support.processes.object_store import Weed
 from tests.support.processes.postgres import Cluster

@@ -17,8 +17,7 @@ from pydantic import ValidationError
 from service.audit.background import ChildProcesses, ChildState, Progress, report
 from service.core.records.base import Record
 from service.store.durable_effects import Clock, utc_text
-from service.store.verification.chain_checks import Fault
-from service.store.verification.pose_checks import NOT_COMPARED
+from service.store.verification.chain_checks import NOT_COMPARED, Fault
 from service.store.verification.verify import AuditReport, verify
 
 LISTED = 500  # most faults listed in a result

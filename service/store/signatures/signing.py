@@ -1,18 +1,25 @@
-"""Signing with Ed25519: checkpoints over the ends of chains, the key of a data folder, and its replacement."""
+"""Signing with Ed25519: who signs a site, checkpoints over the ends of sound chains, the key and its replacement."""
 
 from __future__ import annotations
 
 import base64
+import os
+import secrets
+import socket
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from sqlalchemy import Connection, select
+from pydantic import ValidationError
+from sqlalchemy import Connection, bindparam, select
 
-from service.core.records.events import KeyChanged, Payload, RunSigned, SignaturesWrittenAgain
+from service.core.errors import IntegrityError, StoreError
+from service.core.records.events import KeyChanged, Payload, RunSigned, SignaturesWrittenAgain, SignerNamed
+from service.store.data_folder import file_mode, open_new
 from service.store.database.database import is_postgres
 from service.store.database.tables import event_index, events, runs
 from service.store.durable_effects import utc_text
-from service.store.events import read_head, to_event
+from service.store.events import ROOT, read_head, to_event
 from service.store.records import SITE, Checkpoint, SigningKeyError, SignsElsewhereError, UnknownRunError
 from service.store.signatures.checkpoints import (
     KeyFolder,
@@ -27,9 +34,140 @@ from service.store.signatures.checkpoints import (
     statement,
 )
 from service.store.signatures.log import SeenSignatures
-from service.store.signatures.signer import named_signer, require_signer, this_signer
 from service.store.store import Store
-from service.store.verification.soundness import require_sound
+from service.store.verification.chain_checks import Fault, chain_fault
+
+# Which data folder signs a site: of the folders that share one database, the one that the site's chain names.
+#
+# The key and the log of signatures are files of one folder. A second folder that signed would have a log of its
+# own, and each would find the other's signatures missing. In SQLite the database is the folder's own, and nothing
+# is named.
+
+
+FILE = "signer"  # within the data folder: a random name of the folder, which no copy of its keys has
+_NAMED = (
+    select(events.c.payload)
+    .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))
+    .where(event_index.c.run_id == SITE, event_index.c.kind == "signer_named")
+    .order_by(event_index.c.seq.desc())
+    .limit(1)
+)
+
+
+def named_signer(connection: Connection) -> SignerNamed | None:
+    """Return the folder that signs, as the site's chain names it; None for SQLite, or if none was named yet.
+
+    Raises IntegrityError if its event was altered.
+    """
+    payload = connection.execute(_NAMED).scalar() if is_postgres(connection) else None
+    try:
+        return None if payload is None else SignerNamed.model_validate_json(payload)
+    except ValidationError as error:
+        raise IntegrityError(
+            "the event that names the folder that signs cannot be read",
+            where=SITE,
+            remedy="Run `orthocapture audit verify all`; nothing is signed",
+        ) from error
+
+
+def signer_elsewhere(connection: Connection, data_dir: Path) -> SignerNamed | None:
+    """Return the folder that signs if it is not this one."""
+    named = named_signer(connection)
+    return None if named is None or named.signer == _name_of(data_dir) else named
+
+
+def in_another_place(named: SignerNamed, data_dir: Path) -> bool:
+    """Return whether a folder on another host, or another folder of this one, was named as the signer."""
+    return (named.host, named.folder) != (socket.gethostname(), str(data_dir.resolve()))
+
+
+def require_signer(connection: Connection, data_dir: Path) -> None:
+    """Raise SignsElsewhereError if another folder signs this site."""
+    named = signer_elsewhere(connection, data_dir)
+    if named is not None:
+        raise SignsElsewhereError(
+            f"another data folder signs this site: {named.folder} on {named.host}",
+            where=str(data_dir),
+            remedy="Start runs there; a worker and a further server need no key. To let this folder sign instead, "
+            "move keys/ and signatures.jsonl here, then: orthocapture audit sign-here",
+        )
+
+
+def this_signer(data_dir: Path, key_id: str) -> SignerNamed:
+    """Return the event that names this folder as the signer; its random name is written if it has none.
+
+    Raises StoreError.
+    """
+    name = _name_of(data_dir) or _write_name(data_dir)
+    return SignerNamed(signer=name, key_id=key_id, host=socket.gethostname(), folder=str(data_dir.resolve()))
+
+
+def _name_of(data_dir: Path) -> str:
+    try:
+        return (data_dir / FILE).read_text("ascii").strip()
+    except (FileNotFoundError, UnicodeDecodeError):
+        return ""
+    except OSError as error:
+        raise _unreadable(data_dir, error) from error
+
+
+def _write_name(data_dir: Path) -> str:
+    name = secrets.token_hex(16)
+    try:
+        with os.fdopen(open_new(data_dir / FILE, os.O_WRONLY, file_mode(data_dir)), "w", encoding="ascii") as file:
+            file.write(name)
+    except OSError as error:
+        raise _unreadable(data_dir, error) from error
+    return _name_of(data_dir)
+
+
+def _unreadable(data_dir: Path, error: OSError) -> StoreError:
+    return StoreError(
+        f"the name by which this folder signs cannot be used: {error.strerror or error}",
+        where=str(data_dir / FILE),
+        remedy="Look at the permissions of the data folder",
+    )
+
+
+# Put together once: every signature asks them several times.
+_ONE = select(events).where(events.c.run_id == bindparam("run"), events.c.seq == bindparam("last"))
+_AFTER = (
+    select(events).where(events.c.run_id == bindparam("run"), events.c.seq > bindparam("last")).order_by(events.c.seq)
+)
+
+
+def require_sound(store: Store, connection: Connection, run_id: str) -> None:
+    """Raise IntegrityError unless the chain, its earlier signatures and the log of signatures agree.
+
+    Events that this process has verified before are not read again; only the last of them must still be there.
+
+    Args:
+        store: remembers how far each chain was verified, and what its last look at the signatures found.
+        connection: a connection within a transaction.
+        run_id: the chain's run, or SITE.
+    """
+    found = _chain(store, connection, run_id)
+    fault = found if isinstance(found, Fault) else store.seen_signatures.fault(run_id)
+    if fault is None and not isinstance(found, Fault):
+        store.sound_until[run_id] = found
+        return
+    store.seen_signatures.forget()  # it may be put right
+    raise IntegrityError(
+        f"nothing is signed, because the record does not verify: {fault}",
+        where=str(store.database_path),
+        remedy="Run `orthocapture audit verify`; keep the data folder as it is",
+    )
+
+
+def _chain(store: Store, connection: Connection, run_id: str) -> Fault | tuple[int, str]:
+    end = store.sound_until.get(run_id, (0, ROOT))
+    place = {"run": run_id, "last": end[0]}
+    if end[0]:
+        before = connection.execute(_ONE, place).mappings().one_or_none()
+        if before is None or before["sha256"] != end[1]:
+            return Fault(run_id, end[0], "", "this event is not the one that was here before")
+    return chain_fault(run_id, connection.execute(_AFTER, place).mappings(), end)
+
 
 _ACTOR = "service"  # actor of the first key and of run_signed, which the software makes itself
 

@@ -1,18 +1,23 @@
-"""The record compared with its anchors in the object store: anchors and record in, faults, notes and counts out."""
+"""Compares the record with its anchors in the object store: anchors and record in, faults, notes and counts out."""
 
 from __future__ import annotations
 
 import base64
 import binascii
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
+from service.core.errors import StoreError
 from service.core.words import counted
+from service.store.data_folder import object_store_of
 from service.store.objects.anchors import (
+    FOLDER,
     ROOTS,
     LineAnchor,
     ListedVersion,
@@ -346,3 +351,49 @@ def _note_days(found: AnchorFindings, anchors: ReadAnchors, record: RecordSide, 
             f"{counted(total, 'day')} since {days[0]} {'has' if total == 1 else 'have'} no root in the object store; "
             f"the longest time without is {counted(length, 'day')} from {first} on"
         )
+
+
+_AT_ONCE = 8
+_MOST_BYTES = 64 << 20  # the ends of half a million chains
+
+
+@dataclass(frozen=True, slots=True)
+class UnreadAnchors:
+    """The anchors of an object store that could not be read, and why."""
+
+    place: str
+    why: str
+
+
+def read_anchors(data_dir: Path) -> ReadAnchors | UnreadAnchors | None:
+    """Return the anchors that the site.yaml of a folder names; None if it has anchors nowhere.
+
+    A store that is away, or that cannot be opened from here, is no error: a sentence says what was not compared.
+    Raises ConfigurationError if the site's file itself is wrong.
+    """
+    section = object_store_of(data_dir)
+    if section is None or section.lock_days is None:
+        return None
+    # Imported here: for sites only.
+    from service.store.objects.anchors import LockedObjects  # noqa: PLC0415
+    from service.store.objects.opening import open_objects  # noqa: PLC0415
+
+    try:
+        objects = open_objects(data_dir, section)
+        objects.require_bucket()
+        locked = LockedObjects(objects)
+        listed = list(locked.versions(FOLDER))
+        wanted = [found for found in listed if not found.deletion and found.size_bytes <= _MOST_BYTES]
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            read = [version for version in pool.map(locked.read, wanted) if version is not None]
+    except StoreError as error:
+        return UnreadAnchors(section.place, error.what)
+    return ReadAnchors(
+        place=section.place,
+        versions=read,
+        deletions=[found for found in listed if found.deletion],
+        unread=[found for found in listed if found.size_bytes > _MOST_BYTES],
+        lock_days=section.lock_days,
+        patience=timedelta(hours=section.anchor_within_hours),
+        at=datetime.now(UTC),
+    )

@@ -21,7 +21,7 @@ from service.store.database import postgres
 from service.store.database.tables import metadata
 from service.store.event_index import indexed_events, vector, words_of
 from service.store.verification.chain_checks import Fault
-from service.store.verification.search_checks import INDEX_DIFFERS
+from service.store.verification.derived_checks import INDEX_DIFFERS
 
 _WHERE = "the database"
 _AT_ONCE = 500  # events

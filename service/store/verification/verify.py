@@ -6,50 +6,141 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, Table, select, text
 
 from service.core.errors import IntegrityError, StoreError
 from service.store.artefacts import read_artefacts
 from service.store.database.database import Database, is_postgres
 from service.store.database.engine import DATABASE_NAME, RESTORE, database_path
 from service.store.database.opening import open_read_only
-from service.store.database.wal import wal_findings
+from service.store.database.tables import (
+    accounts,
+    artefacts,
+    checkpoints,
+    events,
+    heads,
+    invitations,
+    jobs,
+    runs,
+    sessions,
+)
 from service.store.durable_effects import DurableFiles
 from service.store.events import read_events
-from service.store.objects.anchored import UnreadAnchors, read_anchors
 from service.store.objects.reading import files_elsewhere
-from service.store.records import SITE, Artefact, RunRow, UnknownRunError
+from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp, UnknownRunError
 from service.store.runs import read_runs
+from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import LogLine, log_findings, read_log, written_again_findings
 from service.store.signatures.second_place import copy_faults
-from service.store.signatures.signer import in_another_place, signer_elsewhere
+from service.store.signatures.signing import in_another_place, signer_elsewhere
 from service.store.verification import chain_checks as checks
-from service.store.verification import derived_checks as derived
-from service.store.verification import postgres_checks, search_checks
+from service.store.verification import derived_checks, postgres_checks
 from service.store.verification import signature_checks as signatures
 from service.store.verification.anchor_checks import (
     AnchorCounts,
     AnchorFindings,
     ReadAnchors,
     RecordSide,
+    UnreadAnchors,
     compare,
     lines_not_compared,
     not_compared,
+    read_anchors,
 )
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
-from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
 from service.store.verification.file_checks import (
     Elsewhere,
     Progress,
     elsewhere_notes,
     hash_files,
+    journal_findings,
     unlisted_files,
     unread_files,
+    wal_findings,
 )
-from service.store.verification.journal_checks import journal_findings
 from service.store.verification.people_checks import people_faults
+
+_Rows = dict[str, list[dict[str, Any]]]  # by run
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceRows:
+    """All rows other than the events, which may be many and are streamed instead."""
+
+    run_ids: tuple[str, ...]
+    has_site: bool
+    runs: _Rows
+    heads: _Rows
+    artefacts: _Rows
+    jobs: _Rows
+    checkpoints: Mapping[str, list[Checkpoint]]
+    timestamps: Mapping[str, list[Timestamp]]
+    every_sha256: frozenset[str]
+    accounts: Sequence[Mapping[str, Any]]
+    links: Sequence[Mapping[str, Any]]
+    sessions: Sequence[Mapping[str, Any]]
+    damage: tuple[str, ...]
+
+
+def read_evidence(connection: Connection, run_id: str | None) -> EvidenceRows:
+    """Return the rows of a run and of the site, or with None those of every run. Raises UnknownRunError."""
+    damage = database_damage(connection)
+    known = set(connection.execute(select(runs.c.run_id)).scalars())
+    # A run whose row was deleted may still have events or checkpoints.
+    known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
+    known |= set(connection.execute(select(checkpoints.c.run_id).distinct()).scalars())
+    if run_id is not None and run_id not in known:
+        raise UnknownRunError(
+            f"there is no run {run_id!r}",
+            where=str(connection.engine.url.database),
+            remedy="List the runs with `orthocapture status`",
+        )
+    chosen = tuple(sorted(known)) if run_id is None else (run_id,)
+    read = tuple({*chosen, SITE})
+
+    def rows(table: Table, *order: Any) -> _Rows:
+        grouped: _Rows = {}
+        statement = select(table).where(table.c.run_id.in_(read)) if run_id is not None else select(table)
+        for row in connection.execute(statement.order_by(*order)).mappings():
+            grouped.setdefault(str(row["run_id"]), []).append(dict(row))
+        return grouped
+
+    def all_of(table: Table) -> list[dict[str, Any]]:
+        return [dict(row) for row in connection.execute(select(table)).mappings()]
+
+    return EvidenceRows(
+        run_ids=chosen,
+        has_site=SITE in known,
+        runs=rows(runs),
+        heads=rows(heads),
+        artefacts=rows(artefacts, artefacts.c.run_id, artefacts.c.seq, artefacts.c.position),
+        jobs=rows(jobs, jobs.c.position),
+        checkpoints={run: read_checkpoints(connection, run) for run in read},
+        timestamps={run: read_timestamps(connection, run) for run in read},
+        every_sha256=frozenset(connection.execute(select(artefacts.c.sha256)).scalars()),
+        accounts=all_of(accounts),
+        links=all_of(invitations),
+        sessions=all_of(sessions),
+        damage=damage,
+    )
+
+
+def database_damage(connection: Connection) -> tuple[str, ...]:
+    """Return the messages of SQLite's own check of the database; empty if it is sound, or of a server."""
+    if is_postgres(connection):
+        return ()
+    found = connection.execute(text("PRAGMA integrity_check(5)")).scalars()
+    return tuple(f"SQLite finds the database damaged: {line}" for line in found if line != "ok")
+
+
+def event_rows(connection: Connection, run_id: str) -> Iterator[Mapping[Any, Any]]:
+    """Yield the events of a run in order, read a part at a time."""
+    statement = select(events).where(events.c.run_id == run_id).order_by(events.c.seq)
+    with connection.execution_options(yield_per=500).execute(statement) as rows:
+        yield from rows.mappings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,11 +456,11 @@ class _SignatureCheck:
 def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
     """Yield faults of the schema and of what is derived from the events: references, indexes, queue, words."""
     postgres = is_postgres(connection)
-    yield from (postgres_checks if postgres else derived).schema_faults(connection)
-    yield from (postgres_checks if postgres else derived).reference_faults(connection)
-    yield from derived.index_faults(connection, runs, every_run=every_run)
-    yield from derived.queue_faults(connection, runs)
-    yield from (postgres_checks if postgres else search_checks).content_faults(connection, runs, every_run=every_run)
+    yield from (postgres_checks if postgres else derived_checks).schema_faults(connection)
+    yield from (postgres_checks if postgres else derived_checks).reference_faults(connection)
+    yield from derived_checks.index_faults(connection, runs, every_run=every_run)
+    yield from derived_checks.queue_faults(connection, runs)
+    yield from (postgres_checks if postgres else derived_checks).content_faults(connection, runs, every_run=every_run)
 
 
 def _counted(

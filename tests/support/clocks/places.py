@@ -89,7 +89,7 @@ PLACES = {
     "service/store/database/tables.py": _STAMP,
     "service/store/events.py": _STAMP,
     "service/store/disk_space.py": "age of an unrecorded file",
-    "service/store/verification/journal_checks.py": "names of columns",
+    "service/store/verification/file_checks.py": "names of columns",
     "service/store/restoring.py": _STAMP,
     "service/store/jobs.py": "job's lease, its worker died on another host",
     "service/store/runs.py": "run's lease, its runner lives on another host",

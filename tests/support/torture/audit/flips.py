@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.store.database.engine import database_path
-from service.store.database.wal import wal_findings
 from service.store.signatures.log import NAME
+from service.store.verification.file_checks import wal_findings
 from tests.support.torture.audit import outcome
 from tests.support.torture.audit.outcome import Verdict, verdict
 from tests.support.torture.audit.record import WAL_NAME, Record, put_back

@@ -23,7 +23,7 @@ from service.store.database.engine import database_path
 from service.store.signatures import log as signature_log
 from service.store.signatures.log import LogLine
 from service.store.verification import chain_checks as audit_checks
-from service.store.verification import file_checks, search_checks
+from service.store.verification import derived_checks, file_checks
 from service.store.verification import signature_checks as audit_signatures
 from service.store.verification import verify as audit
 from service.store.verification.chain_checks import Fault
@@ -104,7 +104,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
             unlisted = functools.cache(file_checks.unlisted_files)
             stack.enter_context(patch.object(audit, "unlisted_files", unlisted))
         stack.enter_context(
-            patch.object(search_checks, "content_faults", _remembered_contents(database_stays=database_stays))
+            patch.object(derived_checks, "content_faults", _remembered_contents(database_stays=database_stays))
         )
         gc.disable()
         stack.callback(gc.enable)
@@ -123,7 +123,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
 
 def _remembered_contents(*, database_stays: bool) -> Callable[..., list[Fault]]:
     kept: dict[object, list[Fault]] = {}
-    content_faults = search_checks.content_faults
+    content_faults = derived_checks.content_faults
 
     def faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> list[Fault]:
         key: object = tuple(run_ids), every_run
