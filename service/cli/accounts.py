@@ -8,7 +8,7 @@ import typer
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.options import OperatorOption, PasswordOption, acting_person
-from service.people.rows import plain_name
+from service.people.person import plain_name
 from service.people.sessions import People
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint_here

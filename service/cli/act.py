@@ -22,8 +22,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState, connected_arms, lost_arms
 from service.followed_run import RunRecord, read_log
 from service.notes import NotePhotograph, require_size, take_note
-from service.people.authorisation import Identity, identity_for, who_acts, who_pauses
-from service.people.sessions import People
+from service.people.sessions import Identity, People, identity_for, who_acts, who_pauses
 from service.run_acts import cancel_computation, read_region, see_robot, step_to_draw_for, tick_item
 from service.run_start import record_refusal, recorded_run
 from service.store.records import Job

@@ -40,7 +40,7 @@ from service.core.records.entered import cleaned_name
 from service.core.units import megabytes
 from service.core.words import counted
 from service.followed_run import read_log
-from service.people.authorisation import Identity
+from service.people.sessions import Identity
 from service.run_acts import release_run, require_releasable
 from service.run_start import recorded_run
 from service.store.data_folder import data_folder, kept_to

@@ -27,9 +27,8 @@ from service.core.text_files import parse_json
 from service.core.words import shown
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
-from service.people.authorisation import Identity, identity_for
 from service.people.person import PeopleError
-from service.people.sessions import People
+from service.people.sessions import Identity, People, identity_for
 from service.runner.operator import AnswerBy
 from service.steps.kinds import ct_import, image_import, scan_import
 

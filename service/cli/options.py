@@ -13,9 +13,8 @@ import typer
 from service.core.errors import ConfigurationError
 from service.core.records.entered import RunAbout, about_run, require_specimen
 from service.core.words import shown
-from service.people.authorisation import Identity, who_acts
 from service.people.person import Permission
-from service.people.sessions import People
+from service.people.sessions import Identity, People, who_acts
 from service.store.store import Store
 
 OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]

@@ -60,8 +60,7 @@ from service.logs.file_log import file_log
 from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.approvals import approve
-from service.people.authorisation import Identity
-from service.people.sessions import People
+from service.people.sessions import Identity, People
 from service.rig import Rig, load_rig
 from service.run_record import results_to_come
 from service.run_start import (

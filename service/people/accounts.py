@@ -11,17 +11,26 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 from service.core.records.entered import reason_of
 from service.core.records.events import AccountChanged
 from service.people.credentials import (
+    KnownTries,
     Passwords,
+    SecretOrigin,
     ShortSecrets,
     new_token,
+    on_screen_of,
     plain_badge,
     require_password,
     require_pin,
     token_sha256,
 )
-from service.people.person import ROLES, Account, AccountError, Invitation, LinkError, Person, Role
-from service.people.rows import (
+from service.people.person import (
+    ROLES,
     SERVICE,
+    Account,
+    AccountError,
+    Invitation,
+    LinkError,
+    Person,
+    Role,
     end_sessions,
     get_account,
     record_change,
@@ -30,7 +39,6 @@ from service.people.rows import (
     require_unlike_others,
     to_account,
 )
-from service.people.tries import KnownTries, SecretOrigin, on_screen_of
 from service.store.database.tables import accounts, invitations
 from service.store.store import Store
 

@@ -12,8 +12,7 @@ from sqlalchemy import Connection, Row, bindparam, insert, select, update
 from service.core.records.base import age_s
 from service.core.records.entered import reason_of
 from service.core.records.run_events import ControlTaken
-from service.people.person import AccountError, ControlError, NotAllowedError, Person
-from service.people.rows import SESSION_S
+from service.people.person import SESSION_S, AccountError, ControlError, NotAllowedError, Person
 from service.store.database.tables import accounts, control, runs, sessions
 from service.store.store import Store
 

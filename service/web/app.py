@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from service.people.tries import failed_tries
+from service.people.credentials import failed_tries
 from service.web import monitoring
 from service.web.audit import evidence, exports, overview
 from service.web.audit import pages as audit

@@ -24,7 +24,7 @@ EDGES = {
     "service/worker/following.py": "arguments of a job with references resolved, before its kind reads them",
     "service/computations/job.py": "writes an answer into an event",
     # rows of SQL, and their hashes
-    "service/people/rows.py": "the row of a session, which is hashed",
+    "service/people/person.py": "the row of a session, which is hashed",
     "service/store/events.py": "hashes and writes the rows of events",
     "service/store/artefacts.py": "hashes the row of an artefact",
     "service/store/runs.py": "values of a row",

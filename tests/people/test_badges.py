@@ -10,9 +10,9 @@ import pytest
 
 from service.core.records.events import AccountChanged
 from service.core.records.run_events import OperatorAction
+from service.people.credentials import FREE_FAILURES
 from service.people.person import AccountError, Role, SignInRefusedError
 from service.people.sessions import KnownBy
-from service.people.tries import FREE_FAILURES
 from service.rig import load_rig
 from service.store.records import SITE
 from service.store.verification.verify import verify

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from sqlalchemy import Connection
 
 from service.core.records.events import ServiceStarted, SignInRecorded
+from service.people.credentials import failed_tries, wait_after_s
 from service.people.person import NotSignedInError, PinRefusedError
 from service.people.sessions import People
-from service.people.tries import failed_tries, wait_after_s
 from service.store.database.database import Database
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused

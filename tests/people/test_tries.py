@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.records.events import AccountChanged, SignInRecorded
+from service.people.credentials import FREE_FAILURES, SecretOrigin, on_screen_of
 from service.people.person import Person, SignInRefusedError
 from service.people.sessions import KnownBy, People
-from service.people.tries import FREE_FAILURES, SecretOrigin, on_screen_of
 from service.store.records import SITE
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, web_site

@@ -21,7 +21,7 @@ from service.core.errors import DataError, IntegrityError, StoreError
 from service.core.protocol import Protocol
 from service.core.records.run_events import RunStarted
 from service.core.run.fold import FoldedRun, fold
-from service.people.rows import full_names
+from service.people.person import full_names
 from service.store.artefacts import chunks_of, read_artefacts
 from service.store.database.tables import artefacts as artefact_table
 from service.store.database.tables import events as event_table

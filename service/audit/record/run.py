@@ -13,7 +13,7 @@ from service.core.records.events import Event
 from service.core.records.run_events import RunStarted
 from service.core.run.fold import FoldedRun, fold
 from service.core.run.state import RunState
-from service.people.rows import full_names, named
+from service.people.person import full_names, named
 from service.steps import params_models
 from service.store.artefacts import ArtefactFiles, read_artefacts
 from service.store.database.opening import open_read_only

@@ -16,8 +16,8 @@ from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates import refuse_data_set, refuse_export, refuse_release, release_meaning
 from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement
 from service.core.records.run_events import RunReleased
+from service.people.credentials import on_screen_of
 from service.people.person import NotAllowedError, Person
-from service.people.tries import on_screen_of
 from service.run_acts import release_run, require_releasable
 from service.web.audit.frame import AuditFrame, CurrentAudit, audit_frame
 from service.web.page.rendering import render

@@ -9,8 +9,8 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, Field
 
 from service.core.errors import OrthocaptureError
+from service.people.credentials import on_screen_of
 from service.people.person import AccountError, AccountJustChangedError, SignInRefusedError
-from service.people.tries import on_screen_of
 from service.web.page.rendering import render, status_of, wants_json
 from service.web.people import administration
 from service.web.people.administration import utc_of

@@ -31,11 +31,10 @@ from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import RunState, lost_arms
 from service.followed_run import RunRecord
 from service.people.approvals import approve, standing_of
-from service.people.authorisation import Identity, identity_for
 from service.people.control import Control
+from service.people.credentials import on_screen_of
 from service.people.person import NotAllowedError
-from service.people.sessions import NAMES, KnownBy
-from service.people.tries import on_screen_of
+from service.people.sessions import NAMES, Identity, KnownBy, identity_for
 from service.rig import load_rig
 from service.run_acts import DECIDE_AGAIN, cancel_computation, out_of_date, see_robot, tick_item
 from service.run_start import record_refusal, require_rig_free, require_runnable, start_run

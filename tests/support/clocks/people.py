@@ -5,10 +5,8 @@ from __future__ import annotations
 from service.core.records.events import ServiceStarted, SignInRecorded
 from service.people.accounts import INVITATION_S
 from service.people.control import UNANSWERED_S, Control
-from service.people.person import Person
-from service.people.rows import SESSION_S
-from service.people.sessions import FIRST_WAIT_S
-from service.people.tries import failed_tries
+from service.people.credentials import FIRST_WAIT_S, failed_tries
+from service.people.person import SESSION_S, Person
 from service.web.security import TRIES_WINDOW_S, Limiter
 from tests.support.clocks.world import Duration, Seen, World, above, allows, below
 from tests.support.pages.web import password_of
