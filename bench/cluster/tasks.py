@@ -37,8 +37,7 @@ from service.compute.sfm.front_end import PAIRS_A_TASK, FrontEnd
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.geometry import Transform
 from service.core.units import megabytes
-from service.dataset.exporter import exporter, write_data_set
-from service.dataset.formats.meshes import png
+from service.dataset.exporter import exporter, png, write_data_set
 from service.dataset.pixels import Photographs, undistorted_data_set
 from service.dataset.records import DataSet, Mesh, PosedView
 from service.machine.executors import computing_at, mapping

@@ -29,7 +29,7 @@ from service.core.records.run_events import JobFinished, RunStarted
 from service.core.run.fold import FoldedRun, fold
 from service.core.run.state import LATER
 from service.core.words import SIMULATED
-from service.dataset.exported import lossless_data_set
+from service.dataset.formats.hdf5 import lossless_data_set
 from service.dataset.records import DataSet
 from service.dataset.registrations import own_registration, registrations
 from service.dataset.run_data_set import data_set_of

@@ -26,8 +26,8 @@ from service.compute.ground_truth.chamfer import ChamferSettings
 from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
-from service.dataset.exported import scaled_data_set
 from service.dataset.exporter import exporter, write_data_set
+from service.dataset.formats.hdf5 import scaled_data_set
 from service.dataset.records import DataSet, Mesh
 from service.machine.executors import VARIABLE
 from service.machine.resources import processor_model

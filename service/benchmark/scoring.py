@@ -17,7 +17,7 @@ from service.compute.ground_truth.surface import Surface, write_ply
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm
-from service.dataset.formats.meshes import png
+from service.dataset.exporter import png
 from service.dataset.records import DataSet, Mesh
 from service.machine.resources import large_arrays_returned
 

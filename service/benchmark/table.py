@@ -22,7 +22,7 @@ from service.compute.ground_truth.heat_map import HeatScale, Panel, heat_bar, he
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
 from service.core.words import SIMULATED
-from service.dataset.formats.meshes import png
+from service.dataset.exporter import png
 
 _NONE = "–"
 

@@ -112,7 +112,7 @@ def run_command(
         from service.benchmark.methods import method_named  # noqa: PLC0415
         from service.benchmark.running import Trial, run_trial  # noqa: PLC0415
         from service.compute.ground_truth.chamfer import ChamferSettings  # noqa: PLC0415
-        from service.dataset.exported import data_set_of_folder  # noqa: PLC0415
+        from service.dataset.formats.hdf5 import data_set_of_folder  # noqa: PLC0415
 
         how = method_named(method)
         if no_wait:

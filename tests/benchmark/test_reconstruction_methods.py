@@ -22,8 +22,8 @@ from service.computations.benchmark import BenchmarkResult
 from service.compute.ground_truth.chamfer import ChamferSettings
 from service.core.errors import ComputeError, ConfigurationError, DataError, OrthocaptureError
 from service.core.geometry import apply, inverse
-from service.dataset.exported import data_set_of_folder, scaled_data_set
 from service.dataset.exporter import exporter, write_data_set
+from service.dataset.formats.hdf5 import data_set_of_folder, scaled_data_set
 from service.dataset.records import DataSet
 from tests.support.processes import reconstruction_stand_in
 from tests.support.scenes.posed import posed_data_set, scene

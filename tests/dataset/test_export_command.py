@@ -19,9 +19,8 @@ from service.compute.pixels.masks import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.run_events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
-from service.dataset.posts import upwards
 from service.dataset.records import Mesh
-from service.dataset.run_data_set import control_spheres, data_set_of, specimen_pixels
+from service.dataset.run_data_set import control_spheres, data_set_of, specimen_pixels, upwards
 from service.dataset.view_covariances import pose_covariance
 from service.store.store import Store
 from service.store.verification.verify import verify

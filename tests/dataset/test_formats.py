@@ -20,8 +20,8 @@ import pytest
 import trimesh
 
 from service.core.geometry import apply, inverse
-from service.dataset.exported import data_set_of_folder
 from service.dataset.exporter import exporters
+from service.dataset.formats.hdf5 import data_set_of_folder
 from service.dataset.records import DataSet, Mesh
 from tests.support.scenes.posed import scene
 from tests.support.scenes.read_formats import check_depth, corners, document, picture, truth_px, written

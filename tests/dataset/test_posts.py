@@ -12,9 +12,8 @@ from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask
 from service.compute.surfaces.constellations import match_constellations
 from service.core.geometry import apply
 from service.dataset.pixels import cropped_data_set
-from service.dataset.posts import posts_of
 from service.dataset.records import DataSet
-from service.dataset.run_data_set import data_set_of, specimen_pixels
+from service.dataset.run_data_set import data_set_of, posts_of, specimen_pixels
 from service.dataset.summary import RunSummary
 from simulators.scene.world import POST_RADIUS_M, RADIUS_M, Scene
 from tests.support.recorded.unpacked_run import unpack_recorded_run

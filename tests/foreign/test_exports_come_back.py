@@ -14,7 +14,7 @@ from service.cli.main import app
 from service.compute.poses.camera_files import read_camera_json
 from service.compute.poses.pose_files import read_poses
 from service.compute.poses.ros_messages import StampedImage
-from service.dataset.exported import data_set_of_folder
+from service.dataset.formats.hdf5 import data_set_of_folder
 from service.dataset.formats.mcap import stamps_ns
 from service.dataset.records import DataSet
 from tests.support.scenes.read_formats import written

@@ -23,8 +23,8 @@ from service.core.protocol import parse_protocol
 from service.core.records.run_events import RegionDrawn
 from service.core.run.state import RunState
 from service.core.words import SIMULATED
-from service.dataset.about_run import about_run
-from service.dataset.preview_surfaces import SimplifiedMesh, fused_mesh, shown_distances
+from service.dataset.preview import SimplifiedMesh, fused_mesh, shown_distances
+from service.dataset.run_data_set import about_run
 from service.dataset.summary import recorded_fusion, summarise
 from service.steps import params_models
 from service.worker.loop import HANDLERS

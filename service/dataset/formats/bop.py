@@ -12,8 +12,7 @@ from service.compute.pixels.views import DEPTH_UNIT_MM, coded_depth
 from service.core.geometry import Array, inverse
 from service.core.units import mm
 from service.dataset.export_folder import ExportFolder, Part, json_bytes
-from service.dataset.exporter import Exporter
-from service.dataset.formats.meshes import mask_png, ply, png
+from service.dataset.exporter import Exporter, mask_png, ply, png
 from service.dataset.records import DataSet, PosedView
 
 _SCENE = "test/000001"

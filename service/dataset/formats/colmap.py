@@ -13,8 +13,7 @@ from service.compute.poses.pose_files import HALF_PIXEL
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse
 from service.dataset.export_folder import ExportFolder, Part
-from service.dataset.exporter import Exporter
-from service.dataset.formats.meshes import ply
+from service.dataset.exporter import Exporter, ply
 from service.dataset.records import DataSet, Mesh, PosedView
 
 _MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "FULL_OPENCV": 6}

@@ -26,8 +26,7 @@ from service.compute.poses.ros_messages import (
 from service.core.errors import ConfigurationError
 from service.core.units import nanoseconds, nanoseconds_of_us
 from service.dataset.export_folder import ExportFolder
-from service.dataset.exporter import Exporter
-from service.dataset.formats.meshes import ground_truth_ply
+from service.dataset.exporter import Exporter, ground_truth_ply
 from service.dataset.records import DataSet, PosedView
 
 FILE = "data_set.mcap"

@@ -15,9 +15,8 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import metres
 from service.dataset.export_folder import ExportFolder, Part
-from service.dataset.exporter import Exporter
+from service.dataset.exporter import Exporter, mask_png, png
 from service.dataset.formats.colmap import write_images
-from service.dataset.formats.meshes import mask_png, png
 from service.dataset.records import DataSet, Mesh, PosedView, only_camera
 
 

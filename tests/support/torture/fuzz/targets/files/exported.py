@@ -22,8 +22,8 @@ from service.compute.ground_truth.surface import Surface, read_ply, write_ply
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
 from service.core.text_files import parse_json
 from service.dataset.export_folder import SUMS
-from service.dataset.exported import data_set_of_folder
 from service.dataset.exporter import exporter, write_data_set
+from service.dataset.formats.hdf5 import data_set_of_folder
 from service.dataset.preview_records import CoveragePreview, Preview, ViewPreview, read_preview, write_preview
 from service.run_acts import read_region
 from service.store.events import canonical
@@ -199,7 +199,7 @@ def _region(data: bytes, _: Path) -> None:
     canonical(region.model_dump(mode="json"))
 
 
-_H5 = "service.dataset.exported:data_set_of_folder"
+_H5 = "service.dataset.formats.hdf5:data_set_of_folder"
 _MATCHING = "service.benchmark.matching:open_matching_data"
 TARGETS: tuple[Target, ...] = (
     *(
