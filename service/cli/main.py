@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from service.cli.exit_status import ExitStatus
 from service.core.loading import begin_loading, end_loading
 from service.core.words import shown, shown_lines
-from service.logs.terminal import show_own_words_only
+from service.logs import show_own_words_only
 
 
 @dataclass(frozen=True, slots=True)

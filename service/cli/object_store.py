@@ -15,7 +15,7 @@ from service.cli.exit_status import ExitStatus
 from service.core.errors import ConfigurationError
 from service.core.units import gigabytes
 from service.core.words import counted
-from service.logs.file_log import file_log
+from service.logs import file_log
 from service.machine.resources import compute_in_background
 from service.store.data_folder import SITE_FILE, kept_to
 from service.store.objects.anchors import AnchorWriter, LockedObjects

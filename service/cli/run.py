@@ -56,7 +56,7 @@ from service.core.records.entered import about_run
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.followed_run import RunFollower
-from service.logs.file_log import file_log
+from service.logs import file_log
 from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.approvals import approve

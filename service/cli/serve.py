@@ -33,7 +33,7 @@ from service.cli.common import (
 from service.core.errors import ConfigurationError, StoreError
 from service.core.records.entered import cleaned_name
 from service.core.words import local_time
-from service.logs.file_log import file_log
+from service.logs import file_log
 from service.people.sessions import People
 from service.rig import load_rig
 from service.station import devices_of

@@ -29,7 +29,7 @@ from service.cli.scheduler import (
 from service.computations import job_kinds
 from service.core.errors import ConfigurationError
 from service.core.words import counted
-from service.logs.file_log import file_log
+from service.logs import file_log
 from service.store.data_folder import kept_to
 from service.worker.pool import work_side_by_side
 from service.worker.uploading import uploading

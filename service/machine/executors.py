@@ -17,7 +17,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
-from service.logs.terminal import show_own_words_only
+from service.logs import show_own_words_only
 from service.machine.resources import processor_model
 
 if TYPE_CHECKING:

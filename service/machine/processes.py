@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import psutil
 
-from service.logs.terminal import show_own_words_only
+from service.logs import show_own_words_only
 
 _Result = TypeVar("_Result")
 

@@ -20,7 +20,7 @@ from service.core.records.run_events import DeviceTrouble, StepFailed, StepMeasu
 from service.core.recovery import TRIED_AGAIN, recovery_policy
 from service.core.run.state import JobState
 from service.core.words import counted
-from service.logs.file_log import at
+from service.logs import at
 from service.monitor.snapshot import living_workers
 from service.runner.held_run import HeldRun
 from service.runner.leave import LeaveWatch

@@ -24,7 +24,7 @@ from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, 
 from service.core.geometry import Array, Transform
 from service.core.records.run_events import ViewpointFailed
 from service.core.units import megapixels
-from service.logs.file_log import at
+from service.logs import at
 from service.steps.context import FurtherCamera, StepContext
 from service.steps.exposure import (
     Exposure,

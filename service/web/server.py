@@ -22,7 +22,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.core.errors import ConfigurationError
-from service.logs.terminal import EscapingFormatter
+from service.logs import EscapingFormatter
 from service.store.durable_effects import Clock
 from service.web.connections import (
     ACCEPTED_AT_ONCE,

@@ -23,7 +23,7 @@ from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.records.run_events import ClusterHost, ComputedOn
 from service.core.run.state import Lane
-from service.logs.file_log import at
+from service.logs import at
 from service.machine.executors import Place, noting_places
 from service.machine.resources import processor_model
 from service.store.records import Job, LeaseLostError

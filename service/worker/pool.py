@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.core.run.state import Lane
-from service.logs.file_log import file_log
-from service.logs.terminal import show_own_words_only
+from service.logs import file_log, show_own_words_only
 from service.machine.executors import computing_at
 from service.machine.resources import compute_in_background, keep_freed_memory
 from service.monitor.snapshot import SignOfLife

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.logs.terminal import ASKED, is_own
+from service.logs import ASKED, is_own
 from tests.support.ct.ct_series import write_series
 from tests.support.rig.rig import REPOSITORY, command
 

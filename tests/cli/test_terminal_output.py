@@ -17,7 +17,7 @@ from service.cli import main as command_line
 from service.cli.common import print_document, print_json, reporting_errors
 from service.core.errors import ConfigurationError
 from service.core.words import shown, shown_json, shown_lines
-from service.logs.terminal import EscapingFormatter
+from service.logs import EscapingFormatter
 from tests.support.every_command import every_command
 from tests.support.hostile_places import ON_A_TERMINAL, TYPED_IN, printed_at, typed_in
 from tests.support.hostile_text import HOSTILE, TYPED, obeyed

@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from drivers.host.hosted_device import hosted
-from service.logs.file_log import NAME, BoundedFile, file_log, without_secrets
+from service.logs import LOG_NAME, BoundedFile, file_log, without_secrets
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker.loop import work
@@ -133,8 +133,8 @@ def test_an_error_that_nobody_foresaw_comes_with_its_traceback_on_one_line(tmp_p
 _WRITER = """
 import logging, sys
 from pathlib import Path
-from service.logs.file_log import BoundedFile
-from service.logs.file_log import file_log
+from service.logs import BoundedFile
+from service.logs import file_log
 data = Path(sys.argv[1])
 with file_log(data, sys.argv[2], handler=BoundedFile(data, file_bytes=20_000, files=4)):
     for number in range(300):
@@ -169,9 +169,9 @@ def test_on_the_last_gigabyte_the_log_stops_with_one_line_and_the_run_goes_on(tm
         bench.rig.shutter.on_capture = lambda number: free.__setitem__(0, 1000 if number == 2 else free[0])
         with file_log(data, "runner", handler=BoundedFile(data, free_bytes=lambda _folder: free[0])):
             assert bench.run().status == "completed"
-            size = (data / "logs" / NAME).stat().st_size
+            size = (data / "logs" / LOG_NAME).stat().st_size
             _log.error("nobody hears this")
-            assert (data / "logs" / NAME).stat().st_size == size
+            assert (data / "logs" / LOG_NAME).stat().st_size == size
             free[0] = 2 << 30
             _log.error("this again")
         bench.must_verify()
@@ -220,7 +220,7 @@ def test_secrets_are_taken_out_and_the_rest_is_kept(tmp_path: Path, text: str, k
             int(text)
         except ValueError:
             _log.exception("with a traceback")
-    content = (data / "logs" / NAME).read_text()
+    content = (data / "logs" / LOG_NAME).read_text()
     assert "s3cr3t" not in content
     said = [json.loads(line) for line in content.splitlines()]
     assert kept in said[0]["event"]
@@ -261,7 +261,7 @@ def test_a_server_logs_no_password_pin_token_or_link(tmp_path: Path) -> None:
     assert {line["process"] for line in said} == {"web"}
     assert ("POST", "/sign-in", 303) in {(line.get("method"), line.get("route"), line.get("status")) for line in said}
     assert ("POST", "/set-up/{token}") in {(line.get("method"), line.get("route")) for line in said}
-    content = (data / "logs" / NAME).read_text()
+    content = (data / "logs" / LOG_NAME).read_text()
     for word in (*secret.values(), "a wrong guess 1", ready["set_up"].split("/")[-1], "of somebody else"):
         assert word not in content
     assert all(str(cookie.value) not in content for cookie in cookies)

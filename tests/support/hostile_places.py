@@ -23,7 +23,7 @@ from service.cli.terminal_output import Terminal, bar_of_counts, bar_of_shares, 
 from service.core.errors import ConfigurationError
 from service.core.records.run_events import DeviceTrouble, OperatorAction, StepNote
 from service.core.words import shown
-from service.logs.terminal import EscapingFormatter
+from service.logs import EscapingFormatter
 from service.store.database.tables import metadata
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint, rotate_key

@@ -24,7 +24,7 @@ from service.cli.main import app
 from service.computations.job import JobAnswer, RecordedContext
 from service.core.errors import OrthocaptureError
 from service.core.records.run_events import StepNote
-from service.logs.file_log import file_log
+from service.logs import file_log
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker import loop

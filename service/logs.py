@@ -1,15 +1,19 @@
-"""Writes a process's log records to the data folder as JSON too; the terminal's output stays as it is.
+"""Logs of the runner, worker, web server and drivers as JSON lines, for finding causes; they are not evidence.
 
-The file is rotated by size and bounded in total, secrets are removed from its lines, and each line says what the
-process worked on when it was written.
+A file is rotated by size and bounded in total, secrets are removed from its lines, and each line says what the
+process worked on when it was written. The output of libraries stays off the terminal, so that people read there
+only what this program says; their records still reach the files, from warnings up. With ORTHOCAPTURE_LIBRARY_WORDS=1
+in the environment, everything appears on the terminal too.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import logging
 import os
+import platform
 import re
 import shutil
 from collections.abc import Callable, Generator, Mapping
@@ -18,14 +22,70 @@ from os import getpid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from service.core.disk_space import LEAST_FREE_BYTES
 from service.core.units import gigabytes
+from service.core.words import shown_continued
 
 if TYPE_CHECKING:
     from structlog.typing import EventDict, WrappedLogger
 
+ASKED = "ORTHOCAPTURE_LIBRARY_WORDS"
+_OURS = frozenset({"service", "drivers", "simulators", "orthocapture", "root"})
+_QUIET = {  # what native libraries read when they are loaded, here and in every child process
+    "OPENCV_LOG_LEVEL": "SILENT",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+}
+_open_files: list[int] = []  # what C writes to instead of the terminal; it must outlive every library
+
+
+def show_own_words_only() -> None:
+    """Show only the log records of this program from now on, and nothing of what native libraries print.
+
+    It comes before libraries are imported, and holds for those too whose import sets the level of their loggers, as
+    pydicom's does. What Python writes to the error stream stays: tracebacks, and the output of child processes.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(EscapingFormatter("%(asctime)s %(name)s %(levelname)s %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    logging.captureWarnings(capture=True)
+    if os.environ.get(ASKED):
+        return
+    handler.addFilter(is_own)
+    for name, value in _QUIET.items():
+        os.environ.setdefault(name, value)
+    _divert_stdio()
+
+
+class EscapingFormatter(logging.Formatter):
+    """Lines in which nothing is left that a terminal would obey: messages may quote a device or a file."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return one record as lines."""
+        return shown_continued(super().format(record))
+
+
+def is_own(record: logging.LogRecord) -> bool:
+    """Return whether a record is of this program, not of a library."""
+    return record.name.partition(".")[0] in _OURS
+
+
+def _divert_stdio() -> None:
+    """Let C's `stderr` lead nowhere: libjpeg and libpng print there, and offer no switch through OpenCV.
+
+    Only the variable of the C library is set, so descriptor 2, which Python and child processes write to, stays as it
+    is. Other C libraries than glibc may keep the variable in memory that cannot be written.
+    """
+    if platform.libc_ver()[0] != "glibc" or _open_files:
+        return
+    libc = ctypes.CDLL(None)
+    libc.fopen.restype = ctypes.c_void_p
+    nowhere = libc.fopen(os.devnull.encode(), b"w")
+    if nowhere:
+        _open_files.append(nowhere)
+        ctypes.c_void_p.in_dll(libc, "stderr").value = nowhere
+
+
 _LONGEST = 20_000  # characters of one text: the traceback of a deep recursion must not rotate the whole log away
-_OURS = ("service", "drivers", "orthocapture")  # other libraries log too much below warnings
+_OUR_LOGGERS = ("service", "drivers", "orthocapture")  # other libraries log too much below warnings
 _CHILDREN = "drivers.host."  # loggers with which drivers.host passes on what a driver's process logs
 
 
@@ -58,7 +118,7 @@ def file_log(
     levels = [other.level for other in shown]
     for other in shown:
         other.setLevel(before)
-    ours = [logging.getLogger(name) for name in _OURS]
+    ours = [logging.getLogger(name) for name in _OUR_LOGGERS]
     levels_of_ours = [logger.level for logger in ours]
     for logger in ours:
         logger.setLevel(min(before, logging.INFO))
@@ -114,7 +174,7 @@ def _scrubbed(_logger: WrappedLogger, _method: str, line: EventDict) -> EventDic
     return {name: without_secrets(value, name) for name, value in line.items()}
 
 
-NAME = "orthocapture.jsonl"
+LOG_NAME = "orthocapture.jsonl"
 FILE_BYTES = 10_000_000
 FILES = 10  # the current file and the older ones: 100 MB in total
 _STOPPED = "less than {:.1f} GB are free: logging stops until there is more; the evidence is still recorded"
@@ -136,7 +196,10 @@ class BoundedFile(logging.Handler):
         free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
     ) -> None:
         super().__init__(logging.INFO)
+        from service.core.disk_space import LEAST_FREE_BYTES  # noqa: PLC0415 - the terminal needs none of it
+
         self._data = data
+        self._least_free_bytes = LEAST_FREE_BYTES
         self._file_bytes, self._files = file_bytes, files
         self._free_bytes = free_bytes
         self._stream: BinaryIO | None = None
@@ -147,11 +210,13 @@ class BoundedFile(logging.Handler):
         if not self._data.is_dir():
             return  # no data folder yet, and a log must not create one
         with contextlib.suppress(OSError):
-            full = self._free_bytes(self._data) < LEAST_FREE_BYTES
+            full = self._free_bytes(self._data) < self._least_free_bytes
             if full and self._stopped:
                 return
             if full != self._stopped:
-                self._write(self._line(record, _STOPPED.format(gigabytes(LEAST_FREE_BYTES)) if full else _GOES_ON))
+                self._write(
+                    self._line(record, _STOPPED.format(gigabytes(self._least_free_bytes)) if full else _GOES_ON)
+                )
                 self._stopped = full
             if not full:
                 self._write(self._line(record))
@@ -172,7 +237,7 @@ class BoundedFile(logging.Handler):
         folder = self._data / "logs"
         folder.mkdir(exist_ok=True)
         with _locked(folder / ".lock"):
-            path = folder / NAME
+            path = folder / LOG_NAME
             if self._stream is not None and not _is(self._stream, path):  # another process has rotated
                 self._stream.close()
                 self._stream = None
