@@ -36,7 +36,7 @@ from service.core.protocol import Protocol, load_protocol
 from service.core.recorded_devices import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.records.run_events import HostClock
 from service.core.units import gigabytes
-from service.monitor.host import host_clock
+from service.monitor.reporter import host_clock
 from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.station import Station

@@ -13,7 +13,7 @@ from service.core.records.base import Moment, elapsed
 from service.core.records.run_events import LeaveLapsed
 from service.core.run.expected import failed_words
 from service.core.run.state import Leave, RunState
-from service.monitor.host import processor_s
+from service.monitor.reporter import processor_s
 from service.monitor.snapshot import living_workers
 from service.runner.held_run import HeldRun
 from service.steps.context import StepInterruptedError

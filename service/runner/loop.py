@@ -41,7 +41,7 @@ from service.core.run.decide import (
 )
 from service.core.run.expected import tries_words
 from service.core.run.state import HandWork, RunState
-from service.monitor.host import host_clock
+from service.monitor.reporter import host_clock
 from service.runner.execution import Starvation, StepExecution, WorkerWatch, held_up_here
 from service.runner.held_run import HeldRun, held_run
 from service.runner.leave import LeaveWatch

@@ -13,7 +13,7 @@ from drivers.interfaces import DeviceReport
 from service.core.recorded_devices import ClockReading, clock_readings
 from service.core.records.events import Payload
 from service.core.records.run_events import DeviceOpened, HostClock, SessionStarted
-from service.monitor.host import host_clock
+from service.monitor.reporter import host_clock
 from service.store.records import NewArtefact
 from service.store.store import Store
 from tests.support.pages.web import web_site
