@@ -22,14 +22,14 @@ import yaml
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from service.compute.arm_kinematics import matching_arm
-from service.compute.board.board import Board, BoardView
-from service.compute.board.design import NOTHING, CalibrationTargets, ChosenViews
-from service.compute.board.knowledge import BoardKnowledge, refined_knowledge
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.board_design import NOTHING, CalibrationTargets, ChosenViews
+from service.compute.calibration.board_knowledge import BoardKnowledge, refined_knowledge
+from service.compute.calibration.hand_eye import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics_quality import board_distance_m, projection_uncertainty
+from service.compute.calibration.reprojection import board_corners
 from service.compute.camera_model import CameraModel
-from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.hand_eye.reprojection import board_corners
-from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
-from service.compute.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.planning.motion_plan import best_posture
 from service.core.arms import arm_model
 from service.core.geometry import Array, Transform, apply, inverse

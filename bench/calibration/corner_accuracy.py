@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.board.board import Board, find_board
+from service.compute.calibration.board import Board, find_board
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_grey
 from service.core.geometry import apply, transform

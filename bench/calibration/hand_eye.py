@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.arm_correction import corrected_T_base_flange
-from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.arm_kinematics import corrected_T_base_flange
+from service.compute.calibration.hand_eye import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.core.arms import arm_model
 from service.core.geometry import Array
 from simulators.scene.world import ARMS, Scene

@@ -27,12 +27,12 @@ from bench.machine import RESULTS, commit, machine
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.develop import coded, develop
-from service.compute.images.develop_parameters import PARAMETERS, DevelopParameters
 from service.compute.images.photographs import read_image
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.refine import remeasure
+from service.compute.photography import PARAMETERS, DevelopParameters
 from service.compute.pipeline import register_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse

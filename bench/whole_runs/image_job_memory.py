@@ -33,7 +33,7 @@ from bench.whole_runs.job_memory import RADIUS_M, SCENE, Folder
 from service.computations import develop, features, match, merge_scans
 from service.computations.job import JobContext, RecordedContext, handler_of
 from service.computations.kind import JobKind
-from service.compute.images.develop_parameters import PARAMETERS
+from service.compute.photography import PARAMETERS
 from service.core.units import megabytes
 from service.machine.resources import keep_freed_memory
 from simulators.rendering.sensor import bordered, camera_picture, read_out

@@ -39,16 +39,16 @@ from service.computations.conversion import hand_eye_record, seen_board
 from service.computations.kind import JobRecord
 from service.computations.records import Matrix, matrix
 from service.compute.arm_kinematics import active_tool, matching_arm, solve_joints
-from service.compute.board.board import Board
-from service.compute.board.next_poses import SuggestedPose, draw_board_plan, suggest_board_poses
-from service.compute.board.search import UsableViews
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_search import UsableViews
+from service.compute.calibration.hand_eye import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye_fit import Method
+from service.compute.calibration.hand_eye_setup import PoseReading, PosesAsRead, Setup
+from service.compute.calibration.intrinsics import locate_view
+from service.compute.calibration.next_poses import SuggestedPose, draw_board_plan, suggest_board_poses
+from service.compute.calibration.reprojection import BoardCorners, board_corners
 from service.compute.camera_model import CameraModel, read_camera_covariance
-from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
-from service.compute.hand_eye.fit import Method
-from service.compute.hand_eye.reprojection import BoardCorners, board_corners
-from service.compute.hand_eye.setup import PoseReading, PosesAsRead, Setup
 from service.compute.images.photographs import ImageFolder, image_folder
-from service.compute.intrinsics.estimate import locate_view
 from service.compute.poses.camera_files import read_camera_json
 from service.compute.poses.pose_files import only_posed, posed_images
 from service.compute.poses.robot_files import (

@@ -12,7 +12,7 @@ import typer
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder, write_whole
 from service.computations.develop.compute import DevelopedFile, develop_file
-from service.compute.images.develop_parameters import PARAMETERS
+from service.compute.photography import PARAMETERS
 from service.core.errors import ConfigurationError, DataError
 
 _JPEGS = (".jpg", ".jpeg")

@@ -25,14 +25,13 @@ from service.cli.common import (
 )
 from service.computations.calibrate.compute import CalibratedCamera, calibrate_camera
 from service.computations.calibrate.records import Intrinsics
-from service.compute.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
-from service.compute.board.search import UsableViews, find_boards, probe_board, usable_views
+from service.compute.calibration.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
+from service.compute.calibration.board_search import UsableViews, find_boards, probe_board, usable_views
+from service.compute.calibration.intrinsics import IntrinsicsResult
+from service.compute.calibration.intrinsics_adjustment import LensModel
+from service.compute.calibration.intrinsics_quality import ProjectionUncertainty, calibration_plots
 from service.compute.images.photographs import image_folder, image_size
-from service.compute.intrinsics.adjustment import LensModel
-from service.compute.intrinsics.estimate import IntrinsicsResult
-from service.compute.intrinsics.optics import Optics, compare_optics, states_focus, summary
-from service.compute.intrinsics.plots import calibration_plots
-from service.compute.intrinsics.uncertainty import ProjectionUncertainty
+from service.compute.photography import Optics, compare_optics, states_focus, summary
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import metres, mm
 from service.core.words import counted

@@ -19,14 +19,14 @@ from service.computations.records import (
     SphereConfusion,
     matrix,
 )
-from service.compute.arm_correction import ArmCorrection, CorrectedMounting
-from service.compute.board.board import Board
+from service.compute.arm_kinematics import ArmCorrection, CorrectedMounting
+from service.compute.calibration.board import Board
+from service.compute.calibration.hand_eye import CorrectedHandEye, HandEyeAnswer, HandEyeResult
+from service.compute.calibration.hand_eye_setup import Setup, distance
+from service.compute.calibration.hand_eye_uncertainty import BoardSizeFound
+from service.compute.calibration.intrinsics import COVERAGE_GRID, IntrinsicsResult
+from service.compute.calibration.intrinsics_quality import CrossValidation, ProjectionUncertainty, residual_field
 from service.compute.camera_model import CameraCovariance, CameraModel
-from service.compute.hand_eye.estimate import CorrectedHandEye, HandEyeAnswer, HandEyeResult
-from service.compute.hand_eye.setup import Setup, distance
-from service.compute.hand_eye.uncertainty import BoardSizeFound
-from service.compute.intrinsics.estimate import COVERAGE_GRID, IntrinsicsResult
-from service.compute.intrinsics.uncertainty import CrossValidation, ProjectionUncertainty, residual_field
 from service.compute.layout.ambiguity import BoundedLength, LayoutReport, layout_bounds
 from service.compute.pixels.resample import camera_at
 from service.compute.surfaces.mesh_spheres import MeshSphere

@@ -10,9 +10,9 @@ import numpy as np
 
 from service.computations import board_view
 from service.computations.records import Camera, ImageFile, image_of
-from service.compute.board.board import Board, BoardView
-from service.compute.board.design import CalibrationTargets, ChosenViews, PlanPrediction
-from service.compute.board.knowledge import BoardKnowledge, refined_knowledge
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.board_design import CalibrationTargets, ChosenViews, PlanPrediction
+from service.compute.calibration.board_knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import Order, best_posture
 from service.core.errors import ComputeError

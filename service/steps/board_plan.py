@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from service.compute.board.board import Board
-from service.compute.board.design import (
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_design import (
     NOTHING,
     CalibrationTargets,
     ChosenViews,
@@ -18,9 +18,9 @@ from service.compute.board.design import (
     board_candidates,
     choose_poses,
 )
-from service.compute.board.knowledge import BoardKnowledge, Tolerances, nominal_knowledge
-from service.compute.board.view_range import ViewRange
+from service.compute.calibration.board_knowledge import BoardKnowledge, Tolerances, nominal_knowledge
 from service.compute.camera_model import CameraModel
+from service.compute.photography import ViewRange
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import metres
 from service.rig import LensSection

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.board.board import Board
-from service.compute.board.design import CalibrationTargets
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_design import CalibrationTargets
 from service.compute.planning.motion_plan import best_posture
 from service.core.arms import known_arm
 from service.core.errors import ConfigurationError

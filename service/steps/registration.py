@@ -16,7 +16,7 @@ from service.computations import calibrate, detect_spheres, develop, hand_board,
 from service.computations.features import SfmEffort
 from service.computations.records import ArmCorrection, FurtherArm, Mounting, PosedPhotograph, image_of
 from service.computations.register import ARM
-from service.compute.images.develop_parameters import PARAMETERS
+from service.compute.photography import PARAMETERS
 from service.core.errors import ConfigurationError
 from service.core.jobs import Each, Reference
 from service.core.protocol import Protocol, Step

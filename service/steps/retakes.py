@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel
 
 from service.computations.records import image_of
-from service.compute.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
+from service.compute.photography import Optics, OpticsDeparture, compare_optics, summary
 from service.core.errors import ImagesSpoiltError
 from service.core.gates import describe, evaluate_gates
 from service.core.records.run_events import RecordedView

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from service.compute.board.view_range import ViewRange
+from service.compute.photography import ViewRange
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.records.base import Record

@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from service.computations.calibrate.records import BoardSeen
 from service.computations.conversion import intrinsics_record, seen_board
-from service.compute.board.board import Board, BoardView
-from service.compute.camera_model import CameraModel
-from service.compute.intrinsics import adjustment
-from service.compute.intrinsics.adjustment import LensModel
-from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics, locate_view
-from service.compute.intrinsics.uncertainty import (
+from service.compute.calibration import intrinsics_adjustment
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics_adjustment import LensModel
+from service.compute.calibration.intrinsics_quality import (
     board_distance_m,
     calibration_warnings,
     cross_validate,
     projection_uncertainty,
 )
+from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, apply, inverse, look_at, transform
 
 BOARD = Board(10, 14, 0.025)
@@ -130,7 +130,7 @@ def test_the_rational_model_needs_few_more_steps(monkeypatch: pytest.MonkeyPatch
     """Terms that the images do not determine once made it nine times slower: the steps wandered along a valley."""
     views = _views(BOARD, _poses(14, 4), LENS)
     projected: dict[LensModel, int] = {}
-    project = adjustment.project_with_jacobian
+    project = intrinsics_adjustment.project_with_jacobian
     for model in ("opencv4", "rational"):
         counted: list[int] = []
 
@@ -140,7 +140,7 @@ def test_the_rational_model_needs_few_more_steps(monkeypatch: pytest.MonkeyPatch
             counted.append(len(points))
             return project(points, pose, camera)
 
-        monkeypatch.setattr(adjustment, "project_with_jacobian", counting)
+        monkeypatch.setattr(intrinsics_adjustment, "project_with_jacobian", counting)
         result = calibrate_intrinsics(views, BOARD, _size(LENS), model=model)
         projected[model] = len(counted)
         assert result.camera.fx == pytest.approx(LENS.fx, abs=4 * result.sigma["fx"])

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.board.board import Board
-from service.compute.board.search import find_boards, probe_board
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_search import find_boards, probe_board
 from tests.support.boards.board_folder import BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import find_board
-from service.compute.board.knowledge import BoardKnowledge
-from service.compute.board.search import BoardImage, find_part, with_parts
+from service.compute.calibration.board import find_board
+from service.compute.calibration.board_knowledge import BoardKnowledge
+from service.compute.calibration.board_search import BoardImage, find_part, with_parts
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from tests.support.boards.board_bench import BOARD, LENS, Picture

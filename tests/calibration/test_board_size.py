@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
-from service.compute.hand_eye.fit import Method
-from service.compute.hand_eye.reprojection import BoardCorners
-from service.compute.hand_eye.setup import Setup, inverted
+from service.compute.calibration.hand_eye import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye_fit import Method
+from service.compute.calibration.hand_eye_setup import Setup, inverted
+from service.compute.calibration.reprojection import BoardCorners
 from service.core.errors import ComputeError
 from tests.support.boards.board_sessions import BOARD, T_BASE_BOARD, T_FLANGE_CAMERA, Session, noisy_session
 

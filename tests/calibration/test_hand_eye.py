@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import half_turn
-from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.hand_eye.fit import Method
+from service.compute.calibration.board import half_turn
+from service.compute.calibration.hand_eye import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye_fit import Method
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 

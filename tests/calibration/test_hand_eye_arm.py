@@ -15,20 +15,21 @@ from typer.testing import CliRunner
 from service.cli.calibrate import calibrate_app
 from service.computations import records
 from service.computations.conversion import arm_correction_record, corrected_mounting, hand_eye_record
-from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm_kinematics import (
+    ArmCorrection,
     chain,
+    corrected_T_base_flange,
     dh_jacobian,
     forward,
     matching_arm,
     parallel_jacobian,
     solve_joints,
 )
-from service.compute.board.board import Board
-from service.compute.board.next_poses import draw_board_plan, suggest_board_poses
-from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
-from service.compute.hand_eye.reprojection import BoardCorners
-from service.compute.hand_eye.setup import robust_start
+from service.compute.calibration.board import Board
+from service.compute.calibration.hand_eye import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye_setup import robust_start
+from service.compute.calibration.next_poses import draw_board_plan, suggest_board_poses
+from service.compute.calibration.reprojection import BoardCorners
 from service.compute.poses.pose_files import write_poses_csv
 from service.compute.poses.robot_files import read_joints_csv
 from service.core.arms import ArmModel, arm_model

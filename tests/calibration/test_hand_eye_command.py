@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.board.board import Board
+from service.compute.calibration.board import Board
 from service.core.geometry import Array, inverse
 from tests.support.boards.board_folder import T_BASE_BOARD, T_FLANGE_CAMERA, BoardFolder, board_folder
 

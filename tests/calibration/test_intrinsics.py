@@ -10,11 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board, BoardView, board_points, find_board, half_turn
+from service.compute.calibration.board import Board, BoardView, board_points, find_board, half_turn
+from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics_adjustment import LensModel
+from service.compute.calibration.intrinsics_quality import (
+    calibration_warnings,
+    cross_validate,
+    projection_uncertainty,
+)
 from service.compute.camera_model import CameraModel
-from service.compute.intrinsics.adjustment import LensModel
-from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
-from service.compute.intrinsics.uncertainty import calibration_warnings, cross_validate, projection_uncertainty
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, transform
 from tests.support.scenes.textured_scene import TEXEL_M, Slab, camera_of_width, render

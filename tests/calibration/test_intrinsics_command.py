@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.board.board import Board
+from service.compute.calibration.board import Board
 from service.compute.camera_model import CameraModel
-from service.compute.intrinsics.optics import Optics, compare_optics
+from service.compute.photography import Optics, compare_optics
 from service.compute.poses.camera_files import read_camera_json
 from service.core.errors import DataError
 from service.core.geometry import transform

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.arm_kinematics import active_tool, forward
-from service.compute.hand_eye.setup import PoseReading, PosesAsRead, check_setup
+from service.compute.calibration.hand_eye_setup import PoseReading, PosesAsRead, check_setup
 from service.compute.poses.robot_files import matched_rows, other_orders, read_robot_poses
 from service.core.arms import arm_model
 from service.core.errors import ComputeError

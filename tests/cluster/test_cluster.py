@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.board.board import Board
-from service.compute.board.search import find_boards
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_search import find_boards
 from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, ConfigurationError, DataError

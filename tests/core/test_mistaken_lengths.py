@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.compute.hand_eye.uncertainty import BoardSizeFound
+from service.compute.calibration.hand_eye_uncertainty import BoardSizeFound
 from service.compute.registration.identity import words_of_unit
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.computations import develop, evaluate
 from service.compute.evaluation.control_sphere import ControlSphere
-from service.compute.images.develop_parameters import PARAMETERS, Crop
+from service.compute.photography import PARAMETERS, Crop
 
 DEVELOPED = {
     "viewpoint": "v001", "raw": "a" * 64, "jpeg": "b" * 64,

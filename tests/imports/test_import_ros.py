@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.board.board import Board
+from service.compute.calibration.board import Board
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.geometry import Array, inverse, transform
 from tests.support.boards.board_folder import CAMERA, T_FLANGE_CAMERA, BoardFolder, board_folder

@@ -13,8 +13,8 @@ import pytest
 from service.computations import job_kinds
 from service.computations.job import JobContext, RecordedContext, handler_of
 from service.compute.camera_model import CameraModel
-from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.markers.cones import cone_of_sphere
+from service.compute.photography import PARAMETERS
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse
 from service.store.store import Store

@@ -13,7 +13,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.board.board import Board
+from service.compute.calibration.board import Board
 from service.compute.images.photographs import image_folder
 from service.core.errors import DataError
 from tests.support.boards.board_folder import CAMERA, BoardFolder, board_folder

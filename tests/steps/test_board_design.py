@@ -8,13 +8,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board, BoardView
-from service.compute.board.design import NOTHING, CalibrationTargets, DesignProblem, board_candidates, choose_poses
-from service.compute.board.knowledge import BoardKnowledge, Tolerances, nominal_knowledge, refined_knowledge
-from service.compute.board.view_range import ViewRange
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.board_design import (
+    NOTHING,
+    CalibrationTargets,
+    DesignProblem,
+    board_candidates,
+    choose_poses,
+)
+from service.compute.calibration.board_knowledge import (
+    BoardKnowledge,
+    Tolerances,
+    nominal_knowledge,
+    refined_knowledge,
+)
+from service.compute.calibration.intrinsics import calibrate_intrinsics
+from service.compute.calibration.intrinsics_quality import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel
-from service.compute.intrinsics.estimate import calibrate_intrinsics
-from service.compute.intrinsics.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.photography import ViewRange
 from service.core.geometry import Array, Transform, apply, increment, inverse, transform
 from service.steps.board_plan import FIRST
 

@@ -19,8 +19,7 @@ from service.computations import live_view
 from service.computations.conversion import arm_correction_record
 from service.computations.inputs import robot_camera_poses
 from service.computations.job import JobAnswer, JobContext, RecordedContext
-from service.compute.arm_correction import ArmCorrection, corrected_T_base_flange
-from service.compute.arm_kinematics import postures
+from service.compute.arm_kinematics import ArmCorrection, corrected_T_base_flange, postures
 from service.compute.live import LiveView, clipped_fraction, register_station, sharpness
 from service.compute.markers.predicted import NEAR, ImageOutlines, PredictedSpheres, find_outlines, tone_of
 from service.compute.planning.coverage import (

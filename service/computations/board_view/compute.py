@@ -8,8 +8,8 @@ import numpy as np
 from service.computations import board_view as job
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import BoardSize
-from service.compute.board.board import Board, BoardView, find_board
-from service.compute.board.search import BoardImage
+from service.compute.calibration.board import Board, BoardView, find_board
+from service.compute.calibration.board_search import BoardImage
 from service.compute.images.photographs import image_quality, read_grey
 from service.core.errors import ComputeError
 

@@ -16,16 +16,13 @@ from service.computations.conversion import camera_of, camera_record, hand_eye_r
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import PosedPhotograph
 from service.compute.arm_kinematics import matching_arm
-from service.compute.board.board import Board
-from service.compute.board.knowledge import BoardKnowledge
-from service.compute.board.search import BoardImage, UsableViews, find_boards, usable_views, with_parts
-from service.compute.camera_model import CameraModel
-from service.compute.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
-from service.compute.hand_eye.reprojection import board_corners
-from service.compute.images.photographs import read_grey
-from service.compute.intrinsics.adjustment import LensModel
-from service.compute.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics, locate_view
-from service.compute.intrinsics.uncertainty import (
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_knowledge import BoardKnowledge
+from service.compute.calibration.board_search import BoardImage, UsableViews, find_boards, usable_views, with_parts
+from service.compute.calibration.hand_eye import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics_adjustment import LensModel
+from service.compute.calibration.intrinsics_quality import (
     MIN_VIEWS_TO_VALIDATE,
     CrossValidation,
     ProjectionUncertainty,
@@ -34,6 +31,9 @@ from service.compute.intrinsics.uncertainty import (
     cross_validate,
     projection_uncertainty,
 )
+from service.compute.calibration.reprojection import board_corners
+from service.compute.camera_model import CameraModel
+from service.compute.images.photographs import read_grey
 from service.core.errors import DataError
 from service.core.units import metres
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import Hash
-from service.compute.images.develop_parameters import Crop, DevelopParameters
+from service.compute.photography import Crop, DevelopParameters
 
 
 class Arguments(JobRecord):

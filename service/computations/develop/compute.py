@@ -10,8 +10,8 @@ import cv2
 from service.computations import develop as job
 from service.computations.job import JobAnswer, JobContext
 from service.compute.images.develop import Development, develop, encode_tiff
-from service.compute.images.develop_parameters import DevelopParameters
 from service.compute.images.photographs import read_image
+from service.compute.photography import DevelopParameters
 
 
 @dataclass(frozen=True, slots=True)

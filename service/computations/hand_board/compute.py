@@ -10,9 +10,9 @@ from service.computations.hand_view.answer import NewImage, answer_to, read_view
 from service.computations.inputs import nominal_camera
 from service.computations.job import JobAnswer, JobContext
 from service.computations.scene import CaptureScene, limits_of
-from service.compute.board.board import Board, find_board
+from service.compute.calibration.board import Board, find_board
+from service.compute.calibration.intrinsics import coverage_map_of, locate_view
 from service.compute.images.photographs import read_grey
-from service.compute.intrinsics.estimate import coverage_map_of, locate_view
 from service.core.errors import ComputeError
 from service.core.geometry import inverse
 

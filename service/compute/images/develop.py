@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from service.compute.descent import gauss_newton
-from service.compute.images.develop_parameters import PARAMETERS, Crop, DevelopParameters
+from service.compute.photography import PARAMETERS, Crop, DevelopParameters
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 

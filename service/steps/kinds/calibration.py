@@ -30,8 +30,8 @@ from service.steps.retakes import departing_images, optics_departures
 from service.steps.viewpoints import BoardPoses, ViewpointSet, plan_viewpoints
 
 if TYPE_CHECKING:
-    from service.compute.board.board import Board
-    from service.compute.board.knowledge import BoardKnowledge
+    from service.compute.calibration.board import Board
+    from service.compute.calibration.board_knowledge import BoardKnowledge
     from service.steps.board_capture import BoardCapture
 
 _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of it are used
@@ -174,7 +174,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 def board_of_protocol(context: StepContext) -> Board:
     """Return the protocol's board. Raises ConfigurationError if it describes none."""
-    from service.compute.board.board import Board  # noqa: PLC0415 - as above
+    from service.compute.calibration.board import Board  # noqa: PLC0415 - as above
 
     board = context.protocol.board
     if board is None:

@@ -14,12 +14,11 @@ from pydantic import TypeAdapter
 from service.computations.calibrate.records import ArmAnswer, HandEye
 from service.computations.conversion import corrected_mounting
 from service.computations.records import Camera
-from service.compute.arm_correction import corrected_T_base_flange
-from service.compute.arm_kinematics import nearest_posture
-from service.compute.board.board import Board
-from service.compute.board.next_poses import SuggestedPose, suggest_board_poses
+from service.compute.arm_kinematics import corrected_T_base_flange, nearest_posture
+from service.compute.calibration.board import Board
+from service.compute.calibration.hand_eye import HandEyeAnswer
+from service.compute.calibration.next_poses import SuggestedPose, suggest_board_poses
 from service.compute.camera_model import CameraModel
-from service.compute.hand_eye.estimate import HandEyeAnswer
 from service.core.arms import known_arm
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, Transform, inverse

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.arm_correction import CorrectedMounting
-from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.arm_kinematics import CorrectedMounting
+from service.compute.calibration.hand_eye import HandEyeViews, calibrate_hand_eye
 from service.core.arms import arm_model
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, transform

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board
+from service.compute.calibration.board import Board
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Transform, apply, inverse, transform
 from tests.support.boards.board_images import checkerboard, photograph

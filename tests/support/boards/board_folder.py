@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board
+from service.compute.calibration.board import Board
 from service.compute.camera_model import CameraModel
 from service.compute.poses.pose_files import write_poses_csv
 from service.core.geometry import Array, inverse, transform

@@ -13,10 +13,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from service.compute.arm_kinematics import nearest_posture
-from service.compute.board.board import Board
-from service.compute.board.design import CalibrationTargets
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_design import CalibrationTargets
+from service.compute.calibration.reprojection import BoardCorners
 from service.compute.camera_model import CameraModel
-from service.compute.hand_eye.reprojection import BoardCorners
 from service.core.arms import arm_model
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection

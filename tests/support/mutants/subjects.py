@@ -21,7 +21,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
         "service/compute/registration/further_camera.py",
         "service/compute/hybrid/adjustment.py",
         "service/compute/sfm/estimate.py",
-        "service/compute/intrinsics/uncertainty.py",
+        "service/compute/calibration/intrinsics_quality.py",
         "service/dataset/view_covariances.py",
         "service/core/geometry.py",
     ),

@@ -12,9 +12,9 @@ import numpy as np
 
 from service.computations.calibrate.compute import calibrate_camera
 from service.computations.conversion import hand_eye_record
-from service.compute.board.board import BoardView
-from service.compute.board.search import UsableViews
-from service.compute.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.board import BoardView
+from service.compute.calibration.board_search import UsableViews
+from service.compute.calibration.hand_eye import HandEyeViews, calibrate_hand_eye
 from service.core.gates import evaluate_gates
 from service.core.protocol import parse_protocol
 from service.core.records.base import ArtefactRef

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from service.compute.arm_correction import (
+from service.compute.arm_kinematics import (
     ArmCorrection,
     check_arm,
     corrected_T_base_flange,
@@ -19,8 +19,7 @@ from service.compute.arm_correction import (
     dh_joints,
     gear_count,
 )
-from service.compute.hand_eye.reprojection import BoardCorners, solve_reprojection
-from service.compute.hand_eye.setup import (
+from service.compute.calibration.hand_eye_setup import (
     MIN_VIEWS,
     RobustStart,
     deviation,
@@ -30,9 +29,10 @@ from service.compute.hand_eye.setup import (
     solve_closed_form,
     solve_with_scale,
 )
-from service.compute.hand_eye.weighted import (
+from service.compute.calibration.reprojection import (
     FLOOR_M,
     GEOMETRY_KINDS,
+    BoardCorners,
     BoardViews,
     Fit,
     Noise,
@@ -41,6 +41,7 @@ from service.compute.hand_eye.weighted import (
     mahalanobis,
     select_scales,
     solve,
+    solve_reprojection,
     start_at,
 )
 from service.core.arms import ArmModel

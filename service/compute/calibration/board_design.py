@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board
-from service.compute.board.knowledge import (
+from service.compute.calibration.board import Board
+from service.compute.calibration.board_knowledge import (
     BoardKnowledge,
     hand_eye_information,
     inverse_of,
@@ -20,9 +20,9 @@ from service.compute.board.knowledge import (
     lens_prior,
     uncertainty_mm,
 )
-from service.compute.board.view_range import ViewRange
+from service.compute.calibration.intrinsics import COVERAGE_GRID, coverage_map_of
 from service.compute.camera_model import CameraModel
-from service.compute.intrinsics.estimate import COVERAGE_GRID, coverage_map_of
+from service.compute.photography import ViewRange
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.units import deg, mm
 

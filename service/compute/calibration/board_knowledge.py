@@ -9,14 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board, BoardView
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics_adjustment import (
+    Adjustment,
+    linearised,
+    parameters_of,
+    project_with_jacobian,
+)
+from service.compute.calibration.intrinsics_quality import EstimatedCamera, uncertainty_of
+from service.compute.calibration.reprojection import linearise, projection_jacobian
 from service.compute.camera_model import CameraModel
 from service.compute.descent import gauss_newton
-from service.compute.hand_eye.reprojection import projection_jacobian
-from service.compute.hand_eye.weighted import linearise
-from service.compute.intrinsics.adjustment import Adjustment, linearised, parameters_of, project_with_jacobian
-from service.compute.intrinsics.estimate import calibrate_intrinsics, locate_view
-from service.compute.intrinsics.uncertainty import EstimatedCamera, uncertainty_of
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, increment, inverse, skew, transform
 

@@ -1,4 +1,6 @@
-"""Checks whether images were taken with the optics as calibrated: focus, aperture, zoom, lens, body, size."""
+"""How photographs are taken and developed: the views of a board, the optics as calibrated, and how raw files
+become pictures. Loads no image library.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.core.errors import DataError
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRange:
+    """The wanted range of views of the board."""
+
+    tilts_deg: tuple[float, ...] = (4.0, 14.0, 24.0, 32.0, 38.0)  # of the optical axis from the board's normal
+    rolls_deg: tuple[float, ...] = (0.0, 12.0, -12.0, 180.0, 168.0, 192.0)  # of the image about the optical axis
+    distances_m: tuple[float, ...] = (0.62, 0.68, 0.74)
+    azimuths: int = 16
+
 
 # Relative differences that count as equal: EXIF rounds focal length and aperture; focus encoders are coarse.
 _TOLERANCE = {"focal_length_mm": 0.005, "aperture_f": 0.02, "focus_distance_m": 0.02}
@@ -131,3 +144,49 @@ def states_focus(optics: Sequence[Optics]) -> bool:
 
 def _text(value: object) -> str:
     return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+@dataclass(frozen=True, slots=True)
+class DevelopParameters:
+    """The parameters with which every raw file is developed; recorded with each picture, and the same for all.
+
+    Attributes:
+        demosaic: LibRaw's algorithm, by rawpy's name of it; chosen by bench/markers/raw_gain.py.
+        white_balance: `camera`: the gains that the camera recorded for the exposure.
+        primaries: primaries of the picture's colours; the colour matrix is the file's or, without one, LibRaw's for
+            the model.
+        gamma: power and slope of the transfer curve; 1, 1 is linear.
+        highlights: treatment of saturated channels.
+        auto_brightness: true if the content decides the brightness.
+        noise_reduction: true if noise is reduced in any way.
+        orientation: 0: as the sensor read it out.
+        bits: bits of a channel.
+    """
+
+    demosaic: str = "VNG"
+    white_balance: str = "camera"
+    primaries: str = "sRGB"
+    gamma: tuple[float, float] = (1.0, 1.0)
+    highlights: str = "Clip"
+    auto_brightness: bool = False
+    noise_reduction: bool = False
+    orientation: int = 0
+    bits: int = 16
+
+
+PARAMETERS = DevelopParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """The part of the developed area that the JPEG shows, in pixels of that area.
+
+    `found` says where it comes from: `file`: the raw file names it; `moved`: the file names another, and the JPEG
+    shows this one; `matched`: the file names none of the JPEG's size, so it was found by comparison with the JPEG.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    found: str

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service.compute.calibration.hand_eye import HandEyeAnswer
+from service.compute.calibration.reprojection import linearise, projection_jacobian
 from service.compute.camera_model import CameraModel
-from service.compute.hand_eye.estimate import HandEyeAnswer
-from service.compute.hand_eye.reprojection import projection_jacobian
-from service.compute.hand_eye.weighted import linearise
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.units import deg, metres, mm

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import Board, BoardView
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.hand_eye_fit import HandEyeMeasurements, HandEyeSolution, Method, fit_resized
+from service.compute.calibration.hand_eye_setup import CLOSED_FORMS, solve_closed_form
+from service.compute.calibration.intrinsics_adjustment import fit_pose, pose_matrix
+from service.compute.calibration.reprojection import BoardCorners, prior_share, resample, resample_reprojection
 from service.compute.camera_model import CameraCovariance, CameraModel
-from service.compute.hand_eye.fit import HandEyeMeasurements, HandEyeSolution, Method, fit_resized
-from service.compute.hand_eye.reprojection import BoardCorners, resample_reprojection
-from service.compute.hand_eye.setup import CLOSED_FORMS, solve_closed_form
-from service.compute.hand_eye.weighted import prior_share, resample
-from service.compute.intrinsics.adjustment import fit_pose, pose_matrix
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform
 from service.core.units import deg, metres, mistaken_length, mm

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.board.board import Board, BoardView
-from service.compute.camera_model import CameraModel
-from service.compute.intrinsics.adjustment import (
+from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.intrinsics_adjustment import (
     PARAMETER_COUNT,
     PARAMETERS,
     Adjustment,
@@ -23,6 +22,7 @@ from service.compute.intrinsics.adjustment import (
     start,
     start_pose,
 )
+from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 from service.core.units import deg

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.arm_correction import ArmCorrection
-from service.compute.board.board import Board
-from service.compute.camera_model import CameraCovariance
-from service.compute.hand_eye.fit import (
+from service.compute.arm_kinematics import ArmCorrection
+from service.compute.calibration.board import Board
+from service.compute.calibration.hand_eye_fit import (
     ArmTerms,
     HandEyeMeasurements,
     HandEyeSolution,
@@ -30,8 +29,7 @@ from service.compute.hand_eye.fit import (
     turned_back,
     without_size,
 )
-from service.compute.hand_eye.reprojection import BoardCorners, board_covariance
-from service.compute.hand_eye.setup import (
+from service.compute.calibration.hand_eye_setup import (
     CLOSED_FORMS,
     PosesAsRead,
     Setup,
@@ -43,7 +41,7 @@ from service.compute.hand_eye.setup import (
     observability,
     untwist,
 )
-from service.compute.hand_eye.uncertainty import (
+from service.compute.calibration.hand_eye_uncertainty import (
     BoardSizeFound,
     bootstrap_counts,
     bootstrap_covariance,
@@ -54,7 +52,8 @@ from service.compute.hand_eye.uncertainty import (
     size_found,
     size_sigma,
 )
-from service.compute.hand_eye.weighted import Noise
+from service.compute.calibration.reprojection import BoardCorners, Noise, board_covariance
+from service.compute.camera_model import CameraCovariance
 from service.core.arms import ArmModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform

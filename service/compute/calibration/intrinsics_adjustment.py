@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.board.board import BoardView
+from service.compute.calibration.board import BoardView
 from service.compute.camera_model import CameraModel
 from service.compute.descent import Damping, gauss_newton, largest, levenberg_marquardt
 from service.core.errors import ComputeError

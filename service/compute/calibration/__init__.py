@@ -1,0 +1,1 @@
+"""Calibration of a camera, its place on the arm and the arm itself, from images of a board."""
