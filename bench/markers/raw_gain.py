@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from bench.machine import RESULTS, commit, machine
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.develop import coded, develop
 from service.compute.images.photographs import read_image
 from service.compute.markers.cones import Cone, cone_of_sphere
@@ -34,6 +33,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.markers.refine import remeasure
 from service.compute.photography import PARAMETERS, DevelopParameters
 from service.compute.pipeline import register_images
+from service.compute.registration.accuracy import true_error_m
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm

@@ -25,8 +25,8 @@ import pycolmap
 from bench.machine import RESULTS, commit, machine
 from service.compute.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.pipeline import register_images
-from service.compute.registration.cost import RegistrationSettings
 from service.compute.registration.identity import identify
+from service.compute.registration.problem import RegistrationSettings
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages
 from service.compute.sfm.colmap import from_colmap_pose, to_colmap_camera, to_colmap_pixels, to_colmap_pose

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
-from service.compute.evaluation.accuracy import true_error_m
 from service.compute.hybrid.estimate import hybrid_poses
 from service.compute.markers.image_files import detect_all
 from service.compute.pipeline import register_images
+from service.compute.registration.accuracy import true_error_m
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.sfm.options import Effort, Mapper, options_for

@@ -21,15 +21,15 @@ import numpy as np
 from bench.machine import RESULTS, commit, machine
 from drivers.meshes.mesh_file import read_mesh_file
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import true_error_m
 from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.pose_files import read_poses_csv
-from service.compute.registration.cost import RegistrationSettings, residuals
-from service.compute.registration.pose_errors import with_joint_pose_covariance
+from service.compute.registration.accuracy import true_error_m
+from service.compute.registration.problem import RegistrationSettings, residuals
+from service.compute.registration.result import with_joint_pose_covariance
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.sfm.options import Effort, Mapper, options_for

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
 from bench.registration.identity import CAMERA
-from service.compute.evaluation.accuracy import evaluate, leave_one_out, true_error_m
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import (
@@ -26,8 +25,9 @@ from service.compute.markers.records import (
     outline_record,
 )
 from service.compute.pipeline import register_images
-from service.compute.registration.cost import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
+from service.compute.registration.accuracy import evaluate, leave_one_out, true_error_m
 from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

@@ -26,8 +26,8 @@ from service.computations.detect_spheres.compute import read_outlines
 from service.computations.inputs import robot_camera_poses
 from service.compute.camera_model import CameraModel
 from service.compute.pipeline import register_images
-from service.compute.registration.cost import RegistrationSettings
-from service.compute.registration.pose_errors import camera_errors
+from service.compute.registration.problem import RegistrationSettings
+from service.compute.registration.result import camera_errors
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, skew
 from service.core.jobs import jobs_of

@@ -39,7 +39,7 @@ from service.cli.common import (
 from service.cli.exit_status import ExitStatus
 from service.cli.run import drive, end_with_children, sigterm_like_ctrl_c
 from service.computations.evaluate import Row
-from service.compute.evaluation.accuracy import true_error_m
+from service.compute.registration.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import Array, inverse
 from service.core.protocol import LoadedProtocol, load_protocol

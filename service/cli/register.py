@@ -38,7 +38,6 @@ from service.cli.spheres import SeedsOption, spheres_of
 from service.computations.detect_spheres import DetectorName
 from service.computations.detect_spheres.compute import detector_of, search_outlines
 from service.compute.camera_model import read_camera_covariance
-from service.compute.evaluation.control_spheres import LEAST_SHARE, ExpectedNearby
 from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for
 from service.compute.markers.grounded_networks import VARIABLE, weights_in
@@ -48,6 +47,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.pose_files import posed_images
+from service.compute.registration.control_spheres import LEAST_SHARE, ExpectedNearby
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
 from service.core.gates import describe_judged, judge

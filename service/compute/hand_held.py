@@ -17,9 +17,9 @@ from service.compute.markers.cones import Cone, ObservedCones, fit_pose
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.planning.next_views import ViewInformation, view_information
-from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
 from service.compute.registration.hypotheses import paired
 from service.compute.registration.identity import identify_each
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
 from service.compute.scene import ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError

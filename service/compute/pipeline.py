@@ -10,21 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import Evaluation
-from service.compute.evaluation.control_spheres import ControlEvaluation, SearchNearby, evaluate_controls
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.common_errors import UNEXPLAINED, BeyondModel, beyond_model, held_lens_covariance
+from service.compute.registration.accuracy import Evaluation
 from service.compute.registration.contradictions import (
+    UNEXPLAINED,
+    BeyondModel,
     Contradiction,
+    beyond_model,
     describe_left_out,
+    held_lens_covariance,
     odd_images,
     odd_spheres,
     require_handedness,
     too_many,
 )
-from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.control_spheres import ControlEvaluation, SearchNearby, evaluate_controls
 from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.problem import RegistrationSettings
 from service.compute.registration.result import OutlineResidual, RegistrationResult
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

@@ -1,4 +1,4 @@
-"""The inputs that all registrations share: posed images of one camera, and the spheres of a scan."""
+"""What registrations share: posed images of one camera, a scan's spheres, and what is found of a control sphere."""
 
 from __future__ import annotations
 
@@ -70,3 +70,34 @@ class ScanSpheres:
     radius_m: float
     control_m: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     covariance_m2: Array | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ControlSphere:
+    """The evaluation of one control sphere.
+
+    Attributes:
+        index: its index in the list of control spheres.
+        expected: number of images that should show it.
+        measured: number of images in which it was measured.
+        radial_error_mm: mean radial error over its outlines; None if it was not measured.
+        reprojection_error_px: mean reprojection error over its outlines.
+        displacement_mm: distance from where scan and registration put it to where the images see it; None below three
+            images.
+        displacement_sigma_mm: standard deviation of the displacement, as far as the outlines determine it.
+        finding: the fault, and the remedy; "" if there is none.
+    """
+
+    index: int
+    expected: int
+    measured: int
+    radial_error_mm: float | None = None
+    reprojection_error_px: float | None = None
+    displacement_mm: float | None = None
+    displacement_sigma_mm: float | None = None
+    finding: str = ""
+
+    @property
+    def share(self) -> float:
+        """Share of the expected outlines that were measured, 1 if none was expected."""
+        return min(1.0, self.measured / self.expected) if self.expected else 1.0

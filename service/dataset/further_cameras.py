@@ -13,7 +13,7 @@ from service.computations.further_camera import Answer
 from service.computations.records import Matrix
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.views import Splits
-from service.compute.registration.pose_errors import product_jacobians
+from service.compute.registration.result import product_jacobians
 from service.core.geometry import Array, Transform
 from service.core.protocol import Protocol
 from service.core.recorded_devices import ClockOffset, clock_offset

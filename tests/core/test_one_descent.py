@@ -14,7 +14,7 @@ SOLVE = {"np.linalg.solve", "np.linalg.lstsq"}
 DESCENT = {"gauss_newton", "halved_gauss_newton", "levenberg_marquardt"}
 
 OWN_LOOPS = {
-    "evaluation/error_budget.py": "chooses inliers before each step, and keeps the equations of the last",
+    "registration/accuracy.py": "chooses inliers before each step, and keeps the equations of the last",
     "markers/limb.py": "estimates noise, selection and priors again before each step",
     "markers/refine.py": "reweights equations that are linear",
     "hybrid/estimate.py": "solves once for each camera, and iterates nothing",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from service.computations import develop, evaluate
-from service.compute.evaluation.control_sphere import ControlSphere
 from service.compute.photography import PARAMETERS, Crop
+from service.compute.scene import ControlSphere
 
 DEVELOPED = {
     "viewpoint": "v001", "raw": "a" * 64, "jpeg": "b" * 64,

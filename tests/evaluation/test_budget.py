@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.computations.evaluate.compute import budget_record
-from service.compute.evaluation.error_budget import (
+from service.compute.pipeline import register_images
+from service.compute.registration.accuracy import (
     Alignment,
     ErrorBudget,
     MeasuredSpheres,
@@ -23,7 +24,6 @@ from service.compute.evaluation.error_budget import (
     locate_in_images,
     loop_observations,
 )
-from service.compute.pipeline import register_images
 from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from service.compute.evaluation.control_spheres import (
+from service.compute.markers.cones import cone_of_sphere
+from service.compute.markers.predicted import find_nearby
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.control_spheres import (
     ControlEvaluation,
     ExpectedNearby,
     SearchNearby,
     evaluate_controls,
 )
-from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.predicted import find_nearby
-from service.compute.markers.records import SphereOutline
 from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse

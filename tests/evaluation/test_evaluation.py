@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import evaluate, leave_one_out, radial_errors_m, true_error_m
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.accuracy import evaluate, leave_one_out, radial_errors_m, true_error_m
 from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import RegistrationSettings
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

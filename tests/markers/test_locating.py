@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.photographs import read_image, read_reduced
 from service.compute.markers.cones import ObservedCones, cone_of_sphere, fit_pose
 from service.compute.markers.detect import detect_spheres
@@ -20,6 +19,7 @@ from service.compute.markers.image_files import LocatedOutlines, detect_all, loc
 from service.compute.markers.predicted import NEAR, WIDE, PredictedSpheres, locate_predicted, tone_of, visible_cones
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
+from service.compute.registration.accuracy import true_error_m
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, look_at, transform

@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.matching.pairs import relative_covariance, relative_pose
-from service.compute.registration.cost import CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment
-from service.compute.registration.pose_errors import camera_errors
-from service.compute.registration.result import RegistrationResult
+from service.compute.registration.problem import CommonErrors, RegistrationSettings
+from service.compute.registration.result import RegistrationResult, camera_errors
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError

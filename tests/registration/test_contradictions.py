@@ -12,10 +12,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, PipelineResult, register_images
-from service.compute.registration.common_errors import UNEXPLAINED, held_lens_covariance
-from service.compute.registration.contradictions import require_handedness
-from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.contradictions import UNEXPLAINED, held_lens_covariance, require_handedness
 from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import RegistrationSettings
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.registration.identity import Assignment
-from service.compute.registration.pose_errors import with_joint_pose_covariance
-from service.compute.registration.result import RegistrationResult
+from service.compute.registration.result import RegistrationResult, with_joint_pose_covariance
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError

@@ -18,7 +18,7 @@ from service.computations import register
 from service.computations.job import JobContext, RecordedContext
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_record
-from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
 from service.core.geometry import Array, Transform, inverse
 from service.store.store import Store
 from service.worker.loop import HANDLERS

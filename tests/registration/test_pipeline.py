@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.photographs import read_image
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import draw_overlay, register_images
+from service.compute.registration.accuracy import true_error_m
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import inverse

@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.markers.cones import ObservedCones, cone_of_sphere
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import (
+from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import (
     Cost,
     PointCost,
     RegistrationSettings,
     residuals,
     residuals_and_derivative,
 )
-from service.compute.registration.identity import Assignment
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.cost import CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.problem import CommonErrors, RegistrationSettings
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.cost import CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment
-from service.compute.registration.pose_errors import camera_errors
-from service.compute.registration.result import RegistrationResult
+from service.compute.registration.problem import CommonErrors, RegistrationSettings
+from service.compute.registration.result import RegistrationResult, camera_errors
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, look_at, transform

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.registration.further_camera import RigidMean, rigid_mean
-from service.compute.registration.pose_errors import of_inverse, of_product
+from service.compute.registration.result import of_inverse, of_product
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, increment, inverse, rotation_angle_rad, transform
 

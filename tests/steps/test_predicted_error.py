@@ -31,8 +31,8 @@ from service.compute.planning.next_views import (
     predicted_information,
     view_information,
 )
-from service.compute.registration.cost import CommonErrors, RegistrationSettings
 from service.compute.registration.identity import Assignment
+from service.compute.registration.problem import CommonErrors, RegistrationSettings
 from service.compute.registration.solve import register
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError

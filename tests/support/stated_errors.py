@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.compute.evaluation.accuracy import Evaluation
-from service.compute.evaluation.error_budget import Alignment
+from service.compute.registration.accuracy import Alignment, Evaluation
 from service.compute.registration.result import RegistrationResult
 from service.core.geometry import Array
 

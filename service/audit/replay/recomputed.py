@@ -15,7 +15,7 @@ import numpy as np
 from service.audit.record.run import RecordedFiles
 from service.computations import register
 from service.computations.job import JobAnswer
-from service.compute.evaluation.accuracy import true_error_m
+from service.compute.registration.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.jobs import Reference, computed_by, jobs_of, resolve
 from service.core.records.base import ArtefactRef

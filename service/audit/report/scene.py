@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.audit.report.blocks import Drawing, Label, Line, Raster, Rectangle, SceneBlock, Shape
-from service.compute.evaluation.error_budget import Alignment
+from service.compute.registration.accuracy import Alignment
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, apply
 from service.core.units import metres, mm

@@ -18,8 +18,14 @@ from service.computations.job import JobAnswer, JobContext
 from service.computations.records import Hash, PosedPhotograph, SpheresFound
 from service.computations.register import Registration
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.control_spheres import ControlEvaluation, ExpectedNearby, evaluate_controls
-from service.compute.evaluation.error_budget import (
+from service.compute.images.photographs import read_image
+from service.compute.markers.cones import Cone
+from service.compute.markers.detect import options_for
+from service.compute.markers.image_files import search_nearby
+from service.compute.markers.records import SphereOutline
+from service.compute.pipeline import INTRINSICS, Detection, draw_overlay
+from service.compute.pixels.resample import resample
+from service.compute.registration.accuracy import (
     CONTROL_SPHERES,
     Alignment,
     ErrorBudget,
@@ -31,14 +37,8 @@ from service.compute.evaluation.error_budget import (
     locate_in_images,
     loop_observations,
 )
-from service.compute.images.photographs import read_image
-from service.compute.markers.cones import Cone
-from service.compute.markers.detect import options_for
-from service.compute.markers.image_files import search_nearby
-from service.compute.markers.records import SphereOutline
-from service.compute.pipeline import INTRINSICS, Detection, draw_overlay
-from service.compute.pixels.resample import resample
-from service.compute.registration.common_errors import UNEXPLAINED
+from service.compute.registration.contradictions import UNEXPLAINED
+from service.compute.registration.control_spheres import ControlEvaluation, ExpectedNearby, evaluate_controls
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.compute.registration.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres

@@ -26,7 +26,7 @@ from service.compute.registration.further_camera import (
     rigid_pose,
     sighted_pose,
 )
-from service.compute.registration.pose_errors import of_inverse, of_product
+from service.compute.registration.result import of_inverse, of_product
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse

@@ -35,7 +35,7 @@ from service.compute.planning.next_views import (
     next_best_views,
     predicted_information,
 )
-from service.compute.registration.cost import EXPECTED_COMMON_ERRORS
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 

@@ -20,16 +20,14 @@ from service.computations.records import PosedPhotograph, has_poses, matrices, m
 from service.computations.structure_from_motion import ModelFile
 from service.computations.structure_from_motion.compute import joint_pose_covariance
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import leave_one_out
-from service.compute.evaluation.error_budget import Alignment
 from service.compute.hand_held import poses_by_spheres
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, PipelineResult, register_images
-from service.compute.registration.common_errors import UNEXPLAINED, held_lens_covariance
-from service.compute.registration.cost import RegistrationSettings
+from service.compute.registration.accuracy import Alignment, leave_one_out
+from service.compute.registration.contradictions import UNEXPLAINED, held_lens_covariance
 from service.compute.registration.identity import identify
-from service.compute.registration.pose_errors import camera_errors, with_joint_pose_covariance
-from service.compute.registration.result import RegistrationResult
+from service.compute.registration.problem import RegistrationSettings
+from service.compute.registration.result import RegistrationResult, camera_errors, with_joint_pose_covariance
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse

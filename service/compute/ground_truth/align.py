@@ -8,10 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
-from service.compute.evaluation.error_budget import compare_shapes
 from service.compute.ground_truth.fuse import outside, without_specks
 from service.compute.ground_truth.overlap import SphereRegion
 from service.compute.ground_truth.surface import Surface
+from service.compute.registration.accuracy import compare_shapes
 from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError

@@ -23,8 +23,8 @@ from service.compute.hybrid.bundle import (
 )
 from service.compute.markers.cones import Cone, ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.identity import identify
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

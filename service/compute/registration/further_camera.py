@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.descent import gauss_newton
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import RegistrationSettings
 from service.compute.registration.hypotheses import paired
 from service.compute.registration.identity import Assignment, identify_each
-from service.compute.registration.pose_errors import of_inverse, of_product
+from service.compute.registration.problem import RegistrationSettings
+from service.compute.registration.result import of_inverse, of_product
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.descent import halved_gauss_newton
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import Cost, RegistrationSettings
 from service.compute.registration.identity import Assignment
 from service.compute.registration.problem import (
     Blocks,
+    Cost,
     Linearised,
     Problem,
+    RegistrationSettings,
     State,
     assemble,
     compress,

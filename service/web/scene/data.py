@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.computations import further_view, fuse
 from service.computations.records import Point
 from service.computations.register import Registration
-from service.compute.evaluation.error_budget import Alignment
+from service.compute.registration.accuracy import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.base import ArtefactRef
 from service.core.records.run_events import RecordedView, ViewpointCaptured

@@ -13,10 +13,9 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "chain": ("service/store/events.py", "service/store/store.py", "service/store/durable_effects.py"),
     "signatures": ("service/store/signatures/*.py",),
     "verifier": ("service/store/verification/*.py", "service/audit/verify/bundle_verifier.py"),
-    "cost": tuple(f"service/compute/registration/{name}.py" for name in ("cost", "problem", "solve")),
+    "cost": tuple(f"service/compute/registration/{name}.py" for name in ("problem", "solve")),
     "covariances": (
         "service/compute/camera_model.py",
-        "service/compute/registration/pose_errors.py",
         "service/compute/registration/result.py",
         "service/compute/registration/further_camera.py",
         "service/compute/hybrid/adjustment.py",

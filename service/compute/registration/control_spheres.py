@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from service.compute.evaluation.accuracy import Evaluation, evaluate
-from service.compute.evaluation.control_sphere import ControlSphere
-from service.compute.evaluation.error_budget import TriangulatedSphere, locate_in_images
 from service.compute.markers.cones import Cone
 from service.compute.markers.predicted import CLEARLY_VISIBLE, is_another, visible_cones
 from service.compute.markers.records import SphereOutline
+from service.compute.registration.accuracy import Evaluation, TriangulatedSphere, evaluate, locate_in_images
 from service.compute.registration.identity import Assignment
-from service.compute.scene import PosedImages, ScanSpheres
+from service.compute.scene import ControlSphere, PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse
 from service.core.units import mm
 from service.core.words import counted

@@ -1,1 +1,0 @@
-"""Evaluates a registration: errors at control spheres, loop closures and the error budget."""
