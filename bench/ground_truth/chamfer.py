@@ -17,9 +17,8 @@ from pykdtree.kdtree import KDTree
 from scipy.spatial import cKDTree
 
 from bench.machine import RESULTS, machine
-from service.compute.ground_truth.chamfer import chamfer, sample
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.chamfer import chamfer, sample
+from service.compute.surfaces.surface import PointIndex, Surface
 from service.core.geometry import Array
 from service.core.units import mm
 

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.ground_truth.distances import PointIndex, TriangleTree
-from service.compute.ground_truth.fuse import FusionSettings, Source, fuse
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.fuse import FusionSettings, Source, fuse
 from service.compute.surfaces.isosurface import surface
+from service.compute.surfaces.surface import PointIndex, Surface, TriangleTree
 from service.core.geometry import Array, apply
 from service.core.units import metres, mm
 from simulators.ct_suite.volume import Grid, voxelise

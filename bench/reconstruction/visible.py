@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.surface import IntArray, Surface
 from service.compute.pixels.render import RayMesh
+from service.compute.surfaces.surface import IntArray, PointIndex, Surface
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm
 from service.dataset.records import DataSet

@@ -34,7 +34,7 @@ import numpy as np
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from service.computations import coverage_points, ct_surface, fuse, locate_spheres
 from service.computations.job import JobAnswer, JobContext, RecordedContext, handler_of
-from service.compute.ground_truth.surface import Surface, read_ply
+from service.compute.surfaces.surface import Surface, read_ply
 from service.core.records.base import ArtefactRef
 from service.core.units import metres
 from service.machine.resources import keep_freed_memory

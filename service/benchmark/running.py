@@ -22,8 +22,8 @@ from service.benchmark.programs import measured
 from service.benchmark.records import RESULT
 from service.benchmark.scoring import score_mesh, write_scored
 from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Scenario, Score
-from service.compute.ground_truth.chamfer import ChamferSettings
-from service.compute.ground_truth.surface import Surface, write_ply
+from service.compute.surfaces.chamfer import ChamferSettings
+from service.compute.surfaces.surface import Surface, write_ply
 from service.core.errors import ComputeError, ConfigurationError, DataError
 from service.core.units import gigabytes, megabytes
 from service.dataset.exporter import exporter, write_data_set

@@ -9,11 +9,11 @@ import numpy as np
 import trimesh
 
 from service.computations.benchmark import Score
-from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
-from service.compute.ground_truth.fuse import compact
-from service.compute.ground_truth.heat_map import HeatScale, heat_picture
-from service.compute.ground_truth.overlap import Box
-from service.compute.ground_truth.surface import Surface, write_ply
+from service.compute.surfaces.chamfer import ChamferScore, ChamferSettings, chamfer
+from service.compute.surfaces.fuse import compact
+from service.compute.surfaces.heat_map import HeatScale, heat_picture
+from service.compute.surfaces.overlap import Box
+from service.compute.surfaces.surface import Surface, write_ply
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm

@@ -16,10 +16,9 @@ from service.benchmark.methods import Method, Workplace, missing
 from service.benchmark.records import SCENARIOS
 from service.benchmark.running import truth_file
 from service.computations.benchmark import BenchmarkResult, Scenario
-from service.compute.ground_truth.chamfer import OUTLIER_M, DistanceSamples, sample
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.heat_map import HeatScale, Panel, heat_bar, heat_row
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.chamfer import OUTLIER_M, DistanceSamples, sample
+from service.compute.surfaces.heat_map import HeatScale, Panel, heat_bar, heat_row
+from service.compute.surfaces.surface import PointIndex, Surface
 from service.core.errors import DataError
 from service.core.words import SIMULATED
 from service.dataset.exporter import png

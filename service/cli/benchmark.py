@@ -111,7 +111,7 @@ def run_command(
         # These load the numerics, which take seconds.
         from service.benchmark.methods import method_named  # noqa: PLC0415
         from service.benchmark.running import Trial, run_trial  # noqa: PLC0415
-        from service.compute.ground_truth.chamfer import ChamferSettings  # noqa: PLC0415
+        from service.compute.surfaces.chamfer import ChamferSettings  # noqa: PLC0415
         from service.dataset.formats.hdf5 import data_set_of_folder  # noqa: PLC0415
 
         how = method_named(method)

@@ -22,9 +22,9 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
-from service.compute.ground_truth.heat_map import HeatScale, heat_picture, write_heat_mesh
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
+from service.compute.surfaces.heat_map import HeatScale, heat_picture, write_heat_mesh
+from service.compute.surfaces.surface import Surface
 from service.core.errors import ConfigurationError
 from service.core.units import metres, mm
 

@@ -22,9 +22,9 @@ from service.cli.common import (
 )
 from service.cli.exit_status import ExitStatus
 from service.computations.fuse.compute import MEANINGS, STAGES, FusedMeshes, MeshFusionSettings, fuse_meshes
-from service.compute.ground_truth.align import align
-from service.compute.ground_truth.fuse import Source
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.align import align
+from service.compute.surfaces.fuse import Source
+from service.compute.surfaces.surface import Surface
 from service.core.gates import judge
 from service.core.protocol import Gate
 from service.core.records.run_events import GateVerdict

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.surface import ply_bytes
 from service.compute.pixels.metadata import described
+from service.compute.surfaces.surface import ply_bytes
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.loading import declared_kinds, kind_named

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from service.computations.records import SpheresFound
 from service.compute.camera_model import CameraModel
-from service.compute.ground_truth.chamfer import ChamferSettings, chamfer, sample
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.fuse import Source
-from service.compute.ground_truth.heat_map import HeatScale, heat_picture
-from service.compute.ground_truth.surface import Surface, read_ply
 from service.compute.pixels.render import covered_shares, seen_points
 from service.compute.pixels.views import FULL_HD, ImageCrop, marker_free_crops
+from service.compute.surfaces.chamfer import ChamferSettings, chamfer, sample
 from service.compute.surfaces.constellations import match_constellations
+from service.compute.surfaces.fuse import Source
+from service.compute.surfaces.heat_map import HeatScale, heat_picture
+from service.compute.surfaces.surface import PointIndex, Surface, read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 from service.core.units import metres, mm

@@ -19,7 +19,7 @@ from service.benchmark.records import read_results
 from service.benchmark.running import Trial, run_trial
 from service.benchmark.table import figure_png, table_markdown, table_record
 from service.computations.benchmark import BenchmarkResult
-from service.compute.ground_truth.chamfer import ChamferSettings
+from service.compute.surfaces.chamfer import ChamferSettings
 from service.core.errors import ComputeError, ConfigurationError, DataError, OrthocaptureError
 from service.core.geometry import apply, inverse
 from service.dataset.exporter import exporter, write_data_set

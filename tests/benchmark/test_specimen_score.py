@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.compute.ground_truth.fuse import Markers
-from service.compute.ground_truth.surface import Surface, write_ply
+from service.compute.surfaces.fuse import Markers
+from service.compute.surfaces.surface import Surface, write_ply
 from service.dataset.records import Mesh
 from tests.support.scenes.specimen import score_specimen, specimen_of
 

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.render import RayMesh
 from service.compute.stereo.rectify import StereoView
 from service.compute.stereo.steep import (
@@ -24,6 +23,7 @@ from service.compute.stereo.steep import (
     relaxed,
     seen_through,
 )
+from service.compute.surfaces.surface import Surface
 from service.core.geometry import Array, Transform, look_at
 
 CAMERA = CameraModel(400, 300, 600.0, 600.0, 199.5, 149.5)

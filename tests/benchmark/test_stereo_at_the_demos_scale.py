@@ -8,7 +8,7 @@ import pytest
 
 from service.benchmark.methods import methods
 from service.benchmark.running import Trial, run_trial
-from service.compute.ground_truth.chamfer import ChamferSettings
+from service.compute.surfaces.chamfer import ChamferSettings
 from tests.support.scenes.rendered_scene import render_scene
 from tests.support.scenes.simulated_data_set import simulated_data_set
 

@@ -17,10 +17,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.ground_truth import chamfer as compared
-from service.compute.ground_truth.chamfer import ChamferSettings, chamfer, sample
-from service.compute.ground_truth.distances import PointIndex, TriangleTree
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces import chamfer as compared
+from service.compute.surfaces.chamfer import ChamferSettings, chamfer, sample
+from service.compute.surfaces.surface import PointIndex, Surface, TriangleTree
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
 

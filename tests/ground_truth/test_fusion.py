@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from service.compute.ground_truth.align import close_transforms, distance_changes
-from service.compute.ground_truth.fuse import (
+from service.compute.surfaces.align import close_transforms, distance_changes
+from service.compute.surfaces.fuse import (
     Fused,
     FusionSettings,
     Markers,
@@ -24,16 +24,8 @@ from service.compute.ground_truth.fuse import (
     moved_unfolded,
     without_markers,
 )
-from service.compute.ground_truth.overlap import (
-    Box,
-    Prism,
-    RegionCorrection,
-    corrected,
-    outline,
-    overlap,
-    rim_vertices,
-)
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.surfaces.overlap import Box, Prism, RegionCorrection, corrected, outline, overlap, rim_vertices
+from service.compute.surfaces.surface import IntArray, Surface
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, transform
 from tests.support.ct.fused_scene import BIAS_M, HALF_M, WOUND_M, ct_mesh, height, scan_mesh

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import CtSource, DeviceIdentity, DeviceReport, Mesh, ScanExport, ScannedMesh, Scanner
 from service.computations.job import JobContext
-from service.compute.ground_truth.surface import Surface, read_ply
+from service.compute.surfaces.surface import Surface, read_ply
 from service.core.errors import ProtocolError
 from service.core.geometry import inverse, transform
 from service.core.protocol import parse_protocol

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.overlap import Mask, OverlapLimits, WoundLimits, overlap, propose_wound
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.overlap import Mask, OverlapLimits, WoundLimits, overlap, propose_wound
+from service.compute.surfaces.surface import Surface
 from service.core.geometry import transform
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 
 from service.benchmark.programs.colmap import views_of
-from service.compute.ground_truth.surface import write_ply
 from service.compute.stereo.reconstruct import reconstruct
+from service.compute.surfaces.surface import write_ply
 from service.core.errors import OrthocaptureError
 from service.machine.executors import computing_as_environment_says
 from service.machine.resources import keep_freed_memory

@@ -8,7 +8,7 @@ from service.benchmark.running import OUTPUT, Trial, run_trial
 from service.benchmark.scoring import HEAT_MAP, SCORED
 from service.computations.benchmark import HEAT_MAPS, MESH, PRINTED, SCORED_MESH, Arguments
 from service.computations.job import JobAnswer, JobContext
-from service.compute.ground_truth.chamfer import ChamferSettings
+from service.compute.surfaces.chamfer import ChamferSettings
 from service.machine.executors import LocalProcesses, computing_on
 
 

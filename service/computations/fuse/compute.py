@@ -14,7 +14,7 @@ import numpy as np
 from service.computations import fuse as job
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import Point, SpheresFound, matrix
-from service.compute.ground_truth.align import (
+from service.compute.surfaces.align import (
     Aligned,
     MeshSpheres,
     TransformLoop,
@@ -22,12 +22,12 @@ from service.compute.ground_truth.align import (
     close_transforms,
     common_part,
 )
-from service.compute.ground_truth.chamfer import ChamferScore, ChamferSettings, chamfer
-from service.compute.ground_truth.fuse import Fused, FusionSettings, Markers, Source, without_markers
-from service.compute.ground_truth.fuse import fuse as fuse_surfaces
-from service.compute.ground_truth.heat_map import HeatScale, fusion_picture, write_heat_mesh
-from service.compute.ground_truth.overlap import Box, Prism, RegionCorrection, outline, seen_along
-from service.compute.ground_truth.surface import Surface, write_ply
+from service.compute.surfaces.chamfer import ChamferScore, ChamferSettings, chamfer
+from service.compute.surfaces.fuse import Fused, FusionSettings, Markers, Source, without_markers
+from service.compute.surfaces.fuse import fuse as fuse_surfaces
+from service.compute.surfaces.heat_map import HeatScale, fusion_picture, write_heat_mesh
+from service.compute.surfaces.overlap import Box, Prism, RegionCorrection, outline, seen_along
+from service.compute.surfaces.surface import Surface, write_ply
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.base import ArtefactRef

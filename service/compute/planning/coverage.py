@@ -18,8 +18,8 @@ from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from service.compute.camera_model import CameraModel
-from service.compute.ground_truth.chamfer import random_places
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.surfaces.chamfer import random_places
+from service.compute.surfaces.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 

@@ -12,8 +12,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from service.compute.ground_truth.surface import Surface
 from service.compute.stereo.matching import DepthMap
+from service.compute.surfaces.surface import Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
 

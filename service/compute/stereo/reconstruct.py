@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.render import RayMesh
 from service.compute.stereo.depth_maps import Pair, depth_maps, stored_views
 from service.compute.stereo.fusion import fused, surface_of
 from service.compute.stereo.matching import DepthMap
 from service.compute.stereo.rectify import StereoView, looked_at_m, stereo_pairs
 from service.compute.stereo.steep import closed, completed
+from service.compute.surfaces.surface import Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.machine.resources import return_freed_memory

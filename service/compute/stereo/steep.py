@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.render import RayMesh
 from service.compute.stereo.rectify import StereoView
+from service.compute.surfaces.surface import PointIndex, Surface
 from service.core.geometry import Array, apply, inverse
 
 # What follows is in pixels of the images, at the object.

@@ -1,1 +1,1 @@
-"""Spheres and surfaces in scans and CT volumes."""
+"""Surfaces of scans and CT volumes: their spheres, their fusion to the ground truth, and distances between them."""

@@ -13,15 +13,16 @@ from scipy.spatial import cKDTree
 from service.compute.surfaces.sphere_candidates import candidates, rough_centres, vote_peaks
 from service.compute.surfaces.sphere_fit import (
     CHUNK,
+    CentreUncertainty,
     IntArray,
     SphereFit,
     SphereSamples,
     Surfels,
+    centre_uncertainties,
     fit_sphere,
     sample_weights,
     surfels,
 )
-from service.compute.surfaces.sphere_noise import CentreUncertainty, centre_uncertainties
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.units import MISTAKEN_LENGTHS, deg, mm

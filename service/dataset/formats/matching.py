@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.chamfer import random_points
-from service.compute.ground_truth.surface import Surface
 from service.compute.matching.loader import View as GroundTruth
 from service.compute.matching.pairs import (
     LEAST_OVERLAP,
@@ -24,6 +22,8 @@ from service.compute.matching.pairs import (
     listed_pairs,
     points_seen,
 )
+from service.compute.surfaces.chamfer import random_points
+from service.compute.surfaces.surface import Surface
 from service.core.units import mm, mrad
 from service.dataset.export_folder import ExportFolder, Part
 from service.dataset.exporter import Exporter

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.surfaces.surface import IntArray, Surface
 from service.core.geometry import Array, transform
 
 HALF_M = (0.030, 0.025)

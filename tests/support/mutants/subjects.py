@@ -26,9 +26,9 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     ),
     "exporters": ("service/dataset/formats/**/*.py", "service/dataset/exporter.py"),
     "fusion": (
-        "service/compute/ground_truth/fuse.py",
-        "service/compute/ground_truth/overlap.py",
-        "service/compute/ground_truth/align.py",
+        "service/compute/surfaces/fuse.py",
+        "service/compute/surfaces/overlap.py",
+        "service/compute/surfaces/align.py",
         "service/compute/surfaces/constellations.py",
     ),
     "watchdogs": ("drivers/arm/*.py", "drivers/ur/watchdog.py", "drivers/ur/safety.py", "drivers/host/heartbeat.py"),

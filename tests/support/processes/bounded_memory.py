@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth import chamfer, distances, fuse, overlap
-from service.compute.ground_truth import surface as surfaces
-from service.compute.ground_truth.surface import Surface
 from service.compute.planning import coverage
-from service.compute.surfaces import isosurface
+from service.compute.surfaces import chamfer, fuse, isosurface, overlap
+from service.compute.surfaces import surface as surfaces
+from service.compute.surfaces.surface import Surface
 from service.core.geometry import Array
 
 SMALLER = 20  # times than usual
@@ -62,7 +61,7 @@ def _everything(surface: coverage.CoverageSurface, *_: object) -> NDArray[np.boo
 
 def nearest(n: int) -> None:
     """The distances of a few points to 180,000 faces."""
-    distances.TriangleTree(wavy(n, 0.1)).nearest(np.zeros((10, 3)), np.full(10, 0.01))
+    surfaces.TriangleTree(wavy(n, 0.1)).nearest(np.zeros((10, 3)), np.full(10, 0.01))
 
 
 def extracted(n: int) -> None:
@@ -86,7 +85,7 @@ def main() -> None:
     compute, limit_mb = COMPUTATIONS[sys.argv[1]], float(sys.argv[2])
     for module, name in (
         (surfaces, "FACES"), (chamfer, "_BLOCK"), (chamfer, "MOST_COMPARED"), (fuse, "_VERTICES"),
-        (overlap, "_POINTS"), (overlap, "_FACES"), (fuse, "_FACES"), (distances, "_LEAVES"),
+        (overlap, "_POINTS"), (overlap, "_FACES"), (fuse, "_FACES"), (surfaces, "_LEAVES"),
         (isosurface, "_FACES"),
     ):  # fmt: skip
         if hasattr(module, name):

@@ -24,8 +24,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from service.compute.ground_truth.overlap import Mask, distance_to
-from service.compute.ground_truth.surface import IntArray
+from service.compute.surfaces.overlap import Mask, distance_to
+from service.compute.surfaces.surface import IntArray
 from service.core.geometry import Array
 from service.core.units import mm
 

@@ -10,8 +10,8 @@ import numpy as np
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.scoring import compare
 from service.computations.benchmark import Score
-from service.compute.ground_truth.fuse import Markers, compact
-from service.compute.ground_truth.surface import Surface
+from service.compute.surfaces.fuse import Markers, compact
+from service.compute.surfaces.surface import Surface
 from service.core.geometry import inverse
 from service.core.units import metres
 from service.dataset.records import Mesh

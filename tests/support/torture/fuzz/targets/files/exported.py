@@ -18,8 +18,8 @@ from service.benchmark.methods import from_unit_box, methods
 from service.benchmark.records import RESULT, read_results
 from service.benchmark.table import table_markdown
 from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
-from service.compute.ground_truth.surface import Surface, read_ply, write_ply
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
+from service.compute.surfaces.surface import Surface, read_ply, write_ply
 from service.core.text_files import parse_json
 from service.dataset.export_folder import SUMS
 from service.dataset.exporter import exporter, write_data_set
@@ -223,7 +223,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("benchmark_result", "service.benchmark.records:read_results", _result, _results, JSON),
     Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
-    Target("own_ply", "service.compute.ground_truth.surface:read_ply", _ply, _plys),
+    Target("own_ply", "service.compute.surfaces.surface:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview_records:read_preview", _preview, _previews, JSON),
     Target("export_request", "service.audit.export.wanted:kept_request", _request, _requests, JSON),
     Target("region", "service.run_acts:read_region", _region, _regions, JSON),

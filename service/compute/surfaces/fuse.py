@@ -12,8 +12,7 @@ from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg
 
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.overlap import (
+from service.compute.surfaces.overlap import (
     Mask,
     OverlapLimits,
     Region,
@@ -25,7 +24,7 @@ from service.compute.ground_truth.overlap import (
     overlap,
     propose_wound,
 )
-from service.compute.ground_truth.surface import FACES, IntArray, Surface
+from service.compute.surfaces.surface import FACES, IntArray, PointIndex, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, place_jacobian
 

@@ -9,8 +9,15 @@ from itertools import chain, islice
 
 import numpy as np
 
-from service.compute.ground_truth.distances import NearestOfBlocks, PointIndex, TriangleTree, show, z_order
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.surfaces.surface import (
+    IntArray,
+    NearestOfBlocks,
+    PointIndex,
+    Surface,
+    TriangleTree,
+    show,
+    z_order,
+)
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm

@@ -8,12 +8,12 @@ from itertools import combinations
 
 import numpy as np
 
-from service.compute.ground_truth.fuse import outside, without_specks
-from service.compute.ground_truth.overlap import SphereRegion
-from service.compute.ground_truth.surface import Surface
 from service.compute.registration.accuracy import compare_shapes
 from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
+from service.compute.surfaces.fuse import outside, without_specks
 from service.compute.surfaces.mesh_spheres import locate_spheres
+from service.compute.surfaces.overlap import SphereRegion
+from service.compute.surfaces.surface import Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, rotation_angle_rad
 

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.chamfer import ChamferScore, DistanceSamples, normals_at
-from service.compute.ground_truth.distances import PointIndex
-from service.compute.ground_truth.fuse import Fused, Source
-from service.compute.ground_truth.surface import IntArray, Surface, write_ply
+from service.compute.surfaces.chamfer import ChamferScore, DistanceSamples, normals_at
+from service.compute.surfaces.fuse import Fused, Source
+from service.compute.surfaces.surface import IntArray, PointIndex, Surface, write_ply
 from service.core.geometry import Array
 from service.core.units import mm
 

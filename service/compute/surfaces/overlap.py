@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from service.compute.ground_truth.distances import PointIndex, closest_on_triangles
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.surfaces.surface import IntArray, PointIndex, Surface, closest_on_triangles
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse
 

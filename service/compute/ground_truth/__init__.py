@@ -1,1 +1,0 @@
-"""The ground-truth surface: distances between surfaces, and the fusion of CT and scan."""
