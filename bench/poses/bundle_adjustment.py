@@ -23,13 +23,13 @@ import numpy as np
 import pycolmap
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.pipeline import register_images
 from service.compute.registration.identity import identify
 from service.compute.registration.problem import RegistrationSettings
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages
 from service.compute.sfm.colmap import from_colmap_pose, to_colmap_camera, to_colmap_pixels, to_colmap_pose
+from service.compute.sfm.hybrid import HybridOptions, HybridPoses, hybrid_poses
 from service.core.geometry import Array, align_points, apply
 from tests.support.scenes.sphere_images import REGISTRATION
 from tests.support.scenes.tracked_scene import TrackedScene, pose_errors, tracked_scene

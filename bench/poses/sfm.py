@@ -20,12 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
 from bench.registration.accuracy import Capture, read_capture
-from service.compute.hybrid.estimate import hybrid_poses
 from service.compute.markers.image_files import detect_all
 from service.compute.pipeline import register_images
 from service.compute.registration.accuracy import true_error_m
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
+from service.compute.sfm.hybrid import hybrid_poses
 from service.compute.sfm.options import Effort, Mapper, options_for
 from service.core.geometry import Array, align_points, apply, inverse
 from tests.support.scenes.rendered_scene import CACHE, render_scene

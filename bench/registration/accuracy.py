@@ -21,7 +21,6 @@ import numpy as np
 from bench.machine import RESULTS, commit, machine
 from drivers.meshes.mesh_file import read_mesh_file
 from service.compute.camera_model import CameraModel
-from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
@@ -32,6 +31,7 @@ from service.compute.registration.problem import RegistrationSettings, residuals
 from service.compute.registration.result import with_joint_pose_covariance
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
+from service.compute.sfm.hybrid import HybridPoses, hybrid_poses
 from service.compute.sfm.options import Effort, Mapper, options_for
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse

@@ -38,7 +38,6 @@ from service.cli.scheduler import (
     reached_scheduler,
 )
 from service.compute.camera_model import CameraCovariance, read_camera_covariance
-from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.images.photographs import image_folder
 from service.compute.markers.image_files import detect_all
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
@@ -46,6 +45,7 @@ from service.compute.poses.pose_files import read_poses_csv, write_poses_csv
 from service.compute.poses.robot_files import read_hand_eye, read_stations
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, write_pose_covariance
+from service.compute.sfm.hybrid import HybridPoses, hybrid_poses
 from service.compute.sfm.options import Effort, Refine, options_for
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import DataError

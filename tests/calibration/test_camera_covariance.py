@@ -12,7 +12,7 @@ import pytest
 from service.compute.calibration.hand_eye import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.reprojection import BoardCorners
 from service.compute.camera_model import CameraCovariance, CameraModel, read_camera_covariance
-from service.compute.hybrid.bundle import AdjustmentData, BundleState, Sigmas, linearise, moved, normal_equations
+from service.compute.sfm.bundle import AdjustmentData, BundleState, Sigmas, linearise, moved, normal_equations
 from service.compute.sfm.estimate import blocks, similarity_covariance
 from service.compute.sfm.features import Tracks
 from service.core.errors import DataError

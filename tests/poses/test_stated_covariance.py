@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.sparse import csr_matrix
 
-from service.compute.hybrid.adjustment import (
+from service.compute.sfm.adjustment import (
     CAUCHY,
     EXPECTED,
     clustered_information,
@@ -18,7 +18,7 @@ from service.compute.hybrid.adjustment import (
     stated_covariance,
     taken_by_points,
 )
-from service.compute.hybrid.bundle import Rows, normal_equations
+from service.compute.sfm.bundle import Rows, normal_equations
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 

@@ -9,19 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraCovariance
-from service.compute.hybrid.bundle import (
-    AdjustmentData,
-    BundleState,
-    Sigmas,
-    SphereSightings,
-    linearise,
-    moved,
-    width,
-)
-from service.compute.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.markers.cones import ObservedCones
 from service.compute.scene import PosedImages
+from service.compute.sfm.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, linearise, moved, width
 from service.compute.sfm.estimate import similarity_covariance
+from service.compute.sfm.hybrid import HybridOptions, HybridPoses, hybrid_poses
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, inverse, transform
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION, REGISTRATION_M

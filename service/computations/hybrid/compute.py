@@ -14,8 +14,8 @@ from service.computations.job import JobAnswer, JobContext
 from service.computations.records import PosedPhotograph, has_poses, matrices, matrix
 from service.computations.structure_from_motion import ModelFile
 from service.computations.structure_from_motion.compute import unpacked_tracks
-from service.compute.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.scene import PosedImages, ScanSpheres
+from service.compute.sfm.hybrid import HybridPoses, hybrid_poses
 from service.core.units import mm
 
 

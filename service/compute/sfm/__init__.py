@@ -1,1 +1,1 @@
-"""Structure from motion with COLMAP, whose code runs in child processes."""
+"""Camera poses from images: structure from motion with COLMAP in child processes, and our own bundle adjustment."""

@@ -28,9 +28,16 @@ from service.compute.sfm.colmap import (
     to_colmap_pixels,
     to_colmap_pose,
 )
-from service.compute.sfm.features import match_descriptors
+from service.compute.sfm.features import (
+    Index,
+    TrackedFeatures,
+    build_tracks,
+    match_descriptors,
+    thinned,
+    triangulate,
+    wide_enough,
+)
 from service.compute.sfm.options import Progress, reduction
-from service.compute.sfm.track_building import Index, TrackedFeatures, build_tracks, thinned, triangulate, wide_enough
 from service.core.errors import DataError, OrthocaptureError
 from service.core.geometry import Array, align_points
 from service.machine.resources import keep_freed_memory

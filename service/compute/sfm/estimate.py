@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from service.compute.camera_model import CameraCovariance, CameraModel
-from service.compute.hybrid.adjustment import clustered_information, first_guess, robust_rows
-from service.compute.hybrid.bundle import AdjustmentData, BundleState, Rows, Sigmas, linearise, normal_equations
+from service.compute.sfm.adjustment import clustered_information, first_guess, robust_rows
+from service.compute.sfm.bundle import AdjustmentData, BundleState, Rows, Sigmas, linearise, normal_equations
 from service.compute.sfm.colmap_process import ColmapProcess
 from service.compute.sfm.features import ImageFeatures, PairMatches, Tracks
 from service.compute.sfm.front_end import CachedFrontEnd, FrontEnd, processes_worth

@@ -18,7 +18,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
         "service/compute/camera_model.py",
         "service/compute/registration/result.py",
         "service/compute/registration/further_camera.py",
-        "service/compute/hybrid/adjustment.py",
+        "service/compute/sfm/adjustment.py",
         "service/compute/sfm/estimate.py",
         "service/compute/calibration/intrinsics_quality.py",
         "service/dataset/view_covariances.py",

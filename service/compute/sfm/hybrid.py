@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraCovariance, CameraModel
-from service.compute.hybrid.adjustment import BundleSolution, solve
-from service.compute.hybrid.bundle import (
+from service.compute.markers.cones import Cone, ObservedCones
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.identity import identify
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.solve import register
+from service.compute.scene import PosedImages, ScanSpheres
+from service.compute.sfm.adjustment import BundleSolution, solve
+from service.compute.sfm.bundle import (
     AdjustmentData,
     BundleState,
     Sigmas,
@@ -21,13 +28,6 @@ from service.compute.hybrid.bundle import (
     normal_equations,
     whitening_of,
 )
-from service.compute.markers.cones import Cone, ObservedCones
-from service.compute.markers.records import SphereOutline
-from service.compute.registration.identity import identify
-from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
-from service.compute.registration.result import RegistrationResult
-from service.compute.registration.solve import register
-from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.features import Tracks
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, skew, transform

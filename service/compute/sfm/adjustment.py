@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import bsr_matrix, csr_matrix
 
 from service.compute.descent import Damping, levenberg_marquardt
-from service.compute.hybrid.bundle import (
+from service.compute.sfm.bundle import (
     AdjustmentData,
     BundleState,
     Normal,

@@ -1,1 +1,0 @@
-"""Hybrid camera poses: tracks, robot poses and measured spheres in one bundle adjustment."""
