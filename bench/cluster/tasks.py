@@ -30,8 +30,8 @@ import psutil
 from bench.machine import RESULTS, commit, machine
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
-from service.compute.pixels.render import RayMesh
-from service.compute.pixels.views import Splits, coded_depth
+from service.compute.images.render import RayMesh
+from service.compute.images.views import Splits, coded_depth
 from service.compute.sfm.front_end import PAIRS_A_TASK, FrontEnd
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.compute.surfaces.surface import Surface

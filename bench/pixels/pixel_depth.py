@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from bench.machine import commit, machine
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh, pixel_rays, seen, seen_rows
+from service.compute.images.render import RayMesh, pixel_rays, seen, seen_rows
 from service.core.geometry import Array, Transform, look_at
 
 RESULTS = Path(__file__).parents[1] / "results"

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.compute.surfaces.surface import IntArray, PointIndex, Surface
 from service.core.geometry import Array, apply, inverse
 from service.core.units import mm

@@ -19,7 +19,7 @@ from service.computations.benchmark import (
     BenchmarkResult,
     Scenario,
 )
-from service.compute.pixels.views import SPARSE_VIEWS
+from service.compute.images.views import SPARSE_VIEWS
 from service.core.errors import DataError, IntegrityError
 from service.core.gates import refuse_data_set, refuse_export
 from service.core.jobs import arguments_name, key_stem

@@ -27,8 +27,8 @@ from service.compute.calibration.hand_eye_uncertainty import BoardSizeFound
 from service.compute.calibration.intrinsics import COVERAGE_GRID, IntrinsicsResult
 from service.compute.calibration.intrinsics_quality import CrossValidation, ProjectionUncertainty, residual_field
 from service.compute.camera_model import CameraCovariance, CameraModel
+from service.compute.images.resample import camera_at
 from service.compute.layout.ambiguity import BoundedLength, LayoutReport, layout_bounds
-from service.compute.pixels.resample import camera_at
 from service.compute.surfaces.mesh_spheres import MeshSphere
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform

@@ -17,7 +17,7 @@ from service.computations.kind import JobRecord
 from service.computations.records import ArmCorrection, ImageFile, ImagesCamera, Mounting, PosedPhotograph
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
-from service.compute.pixels.resample import resample
+from service.compute.images.resample import resample
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.machine.executors import mapping

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.pixels.metadata import described
+from service.compute.images.resample import described
 from service.compute.surfaces.surface import ply_bytes
 from service.core.errors import DataError
 from service.core.geometry import Array

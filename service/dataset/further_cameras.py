@@ -12,7 +12,7 @@ import numpy as np
 from service.computations.further_camera import Answer
 from service.computations.records import Matrix
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.views import Splits
+from service.compute.images.views import Splits
 from service.compute.registration.result import product_jacobians
 from service.core.geometry import Array, Transform
 from service.core.protocol import Protocol

@@ -12,11 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.images.photographs import read_image_of
-from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask
-from service.compute.pixels.metadata import described, with_metadata_of, without_personal_data
-from service.compute.pixels.render import RayMesh, depth_map, seen
-from service.compute.pixels.resample import pinhole_of, undistorted, valid_pixels
-from service.compute.pixels.views import FULL_HD, ImageCrop, Splits, marker_free_crops
+from service.compute.images.render import Cylinder, RayMesh, WorldSphere, depth_map, marker_mask, seen
+from service.compute.images.resample import (
+    described,
+    pinhole_of,
+    undistorted,
+    valid_pixels,
+    with_metadata_of,
+    without_personal_data,
+)
+from service.compute.images.views import FULL_HD, ImageCrop, Splits, marker_free_crops
 from service.core.errors import DataError
 from service.dataset.records import DataSet, Pixels, PosedView
 from service.machine.executors import file_here

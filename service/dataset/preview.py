@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from service.computations.records import SpheresFound
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import covered_shares, seen_points
-from service.compute.pixels.views import FULL_HD, ImageCrop, marker_free_crops
+from service.compute.images.render import covered_shares, seen_points
+from service.compute.images.views import FULL_HD, ImageCrop, marker_free_crops
 from service.compute.surfaces.chamfer import ChamferSettings, chamfer, sample
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.fuse import Source

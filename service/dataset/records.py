@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from service.computations.evaluate import ErrorBudget, Row
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.views import Splits
+from service.compute.images.views import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement, Party, doi_address, licence_address, party

@@ -18,9 +18,8 @@ from drivers.meshes.foreign_text import alike
 from service.computations.records import SpheresFound
 from service.computations.register import ARM, Registration
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Cylinder, WorldSphere, hull_mask, posts_below
-from service.compute.pixels.render import RayMesh
-from service.compute.pixels.views import splits
+from service.compute.images.render import Cylinder, RayMesh, WorldSphere, hull_mask, posts_below
+from service.compute.images.views import splits
 from service.core.errors import ConfigurationError, DataError
 from service.core.gates import BOUNDS_HOLD, accepted_gates, describe, standing
 from service.core.geometry import Array, apply, inverse

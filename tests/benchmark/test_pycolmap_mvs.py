@@ -11,7 +11,7 @@ import pytest
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import methods, missing
 from service.benchmark.programs.colmap import reconstruct, triangulate
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
 from service.dataset.exporter import exporter, write_data_set

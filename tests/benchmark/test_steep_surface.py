@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.compute.stereo.rectify import StereoView
 from service.compute.stereo.steep import (
     averaged,

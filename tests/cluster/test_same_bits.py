@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.compute.sfm.front_end import FrontEnd
 from service.compute.sfm.options import SfmOptions
 from service.compute.stereo.depth_maps import depth_maps, stored_views

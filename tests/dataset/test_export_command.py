@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from service.audit.record.run import read_run
 from service.cli.main import app
-from service.compute.pixels.masks import WorldSphere, marker_mask
+from service.compute.images.render import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.run_events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image_of
-from service.compute.pixels.masks import hull_mask
+from service.compute.images.render import hull_mask
 from service.core.errors import ConfigurationError, DataError
 from service.dataset.export_folder import ExportFolder, export_folder
 from service.dataset.exporter import exporter, exporters, write_data_set

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import RecordedRun, read_run
-from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask
+from service.compute.images.render import Cylinder, WorldSphere, marker_mask
 from service.compute.surfaces.constellations import match_constellations
 from service.core.geometry import apply
 from service.dataset.pixels import cropped_data_set

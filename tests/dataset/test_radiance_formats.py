@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.pixels.masks import WorldSphere
+from service.compute.images.render import WorldSphere
 from service.core.errors import DataError
 from service.core.geometry import Array, inverse
 from service.dataset.pixels import undistorted_data_set

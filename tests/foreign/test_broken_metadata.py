@@ -15,7 +15,7 @@ from PIL import Image
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import exiv2, read_exif
 from drivers.photos.photo_folder import list_photographs
-from service.compute.pixels.metadata import described, with_metadata_of, without_personal_data
+from service.compute.images.resample import described, with_metadata_of, without_personal_data
 from service.import_folder import camera_record
 
 EXIF, XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"

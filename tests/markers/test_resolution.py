@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.resample import camera_at, resample
+from service.compute.images.resample import camera_at, resample
 from service.core.errors import ConfigurationError
 
 CAMERA = CameraModel(1500, 1000, 2100.0, 2101.0, 755.0, 494.0, -0.05, 0.02, 2e-4, -1e-4)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.compute.camera_model import CameraModel
+from service.compute.images.render import RayMesh, depth_map
 from service.compute.matching.loader import OCCLUDED, OUTSIDE, UNKNOWN, VISIBLE, View, correspondences, look_up
 from service.compute.matching.pairs import (
     CLASSES,
@@ -21,7 +22,6 @@ from service.compute.matching.pairs import (
     relative_covariance,
     relative_pose,
 )
-from service.compute.pixels.render import RayMesh, depth_map
 from service.core.geometry import Array, Transform, apply, increment, inverse, look_at
 from tests.support.scenes.posed import UP, reach, scene
 

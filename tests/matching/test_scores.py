@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.images.render import RayMesh, depth_map
 from service.compute.matching.loader import VISIBLE, View, correspondences
 from service.compute.matching.methods.method import Matches
 from service.compute.matching.pairs import relative_pose
@@ -24,7 +25,6 @@ from service.compute.matching.scores import (
     pose_from_matches,
     precisions,
 )
-from service.compute.pixels.render import RayMesh, depth_map
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at
 from tests.support.scenes.posed import UP, scene

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh, covered_shares, depth_map, seen_points
+from service.compute.images.render import RayMesh, covered_shares, depth_map, seen_points
 from service.core.geometry import Array, transform
 
 CAMERA = CameraModel(320, 240, 300.0, 300.0, 159.5, 119.5, k1=-0.05)

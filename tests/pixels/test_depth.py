@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh, pixel_rays, seen, seen_rows
-from service.compute.pixels.views import DEPTH_UNIT_MM, coded_depth
+from service.compute.images.render import RayMesh, pixel_rays, seen, seen_rows
+from service.compute.images.views import DEPTH_UNIT_MM, coded_depth
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, look_at
 

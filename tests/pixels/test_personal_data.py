@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from service.compute.pixels.metadata import with_metadata_of, without_personal_data
+from service.compute.images.resample import with_metadata_of, without_personal_data
 from service.core.errors import DataError
 
 exiv2: Any = importlib.import_module("exiv2")

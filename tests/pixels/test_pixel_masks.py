@@ -12,10 +12,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask, posts_below
-from service.compute.pixels.render import RayMesh, depth_map, pixel_rays, seen
-from service.compute.pixels.resample import pinhole_of, undistorted
-from service.compute.pixels.views import ImageCrop, marker_free_crops, splits
+from service.compute.images.render import (
+    Cylinder,
+    RayMesh,
+    WorldSphere,
+    depth_map,
+    marker_mask,
+    pixel_rays,
+    posts_below,
+    seen,
+)
+from service.compute.images.resample import pinhole_of, undistorted
+from service.compute.images.views import ImageCrop, marker_free_crops, splits
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, apply, inverse, look_at
 

@@ -19,12 +19,12 @@ from service.computations.records import Hash, PosedPhotograph, SpheresFound
 from service.computations.register import Registration
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
+from service.compute.images.resample import resample
 from service.compute.markers.cones import Cone
 from service.compute.markers.detect import options_for
 from service.compute.markers.image_files import search_nearby
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, Detection, draw_overlay
-from service.compute.pixels.resample import resample
 from service.compute.registration.accuracy import (
     CONTROL_SPHERES,
     Alignment,

@@ -1,1 +1,1 @@
-"""Photographs: reading them from files and folders, and developing raw ones."""
+"""Photographs, read and developed, and what belongs to each of their pixels: rays, depth, normals, masks, crops."""

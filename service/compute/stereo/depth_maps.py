@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.compute.stereo.matching import DepthMap, depth_of_pair, guided_depth
 from service.compute.stereo.rectify import StereoView, rectified
 from service.core.geometry import Array, Transform

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.compute.stereo.rectify import Rectified
 from service.core.geometry import Array, Transform
 

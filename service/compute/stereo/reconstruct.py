@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from service.compute.pixels.render import RayMesh
+from service.compute.images.render import RayMesh
 from service.compute.stereo.depth_maps import Pair, depth_maps, stored_views
 from service.compute.stereo.fusion import fused, surface_of
 from service.compute.stereo.matching import DepthMap

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 
-from service.compute.pixels.views import DEPTH_UNIT_MM, coded_depth
+from service.compute.images.views import DEPTH_UNIT_MM, coded_depth
 from service.core.geometry import Array, inverse
 from service.core.units import mm
 from service.dataset.export_folder import ExportFolder, Part, json_bytes

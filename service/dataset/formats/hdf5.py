@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.views import Splits
+from service.compute.images.views import Splits
 from service.core.errors import DataError
 from service.core.text_files import parse_json
 from service.dataset.export_folder import SUMS, ExportFolder, Part, check_folder

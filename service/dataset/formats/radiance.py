@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.pixels.views import DEPTH_UNIT_MM, coded_depth
+from service.compute.images.views import DEPTH_UNIT_MM, coded_depth
 from service.compute.poses.pose_files import HALF_PIXEL, OPENGL, transforms_intrinsics
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse

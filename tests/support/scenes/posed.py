@@ -12,9 +12,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import WorldSphere, posts_below
-from service.compute.pixels.render import RayMesh, pixel_rays
-from service.compute.pixels.views import splits
+from service.compute.images.render import RayMesh, WorldSphere, pixel_rays, posts_below
+from service.compute.images.views import splits
 from service.core.geometry import Array, Transform, apply, inverse, look_at
 from service.dataset.pixels import Photographs
 from service.dataset.records import DataSet, Mesh, PosedView

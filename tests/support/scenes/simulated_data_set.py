@@ -11,9 +11,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import WorldSphere
-from service.compute.pixels.render import RayMesh
-from service.compute.pixels.views import splits
+from service.compute.images.render import RayMesh, WorldSphere
+from service.compute.images.views import splits
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.geometry import Array, apply, inverse
 from service.core.units import metres

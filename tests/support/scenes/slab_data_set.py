@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.pixels.render import RayMesh
-from service.compute.pixels.views import splits
+from service.compute.images.render import RayMesh
+from service.compute.images.views import splits
 from service.dataset.pixels import Photographs
 from service.dataset.records import DataSet, Mesh, PosedView
 from tests.support.scenes.textured_scene import Slab, camera_of_width, render, ring_of_poses, slabs

@@ -1,1 +1,0 @@
-"""Computes what belongs to each pixel of a posed image: rays, depth, normals, masks, undistorted images and crops."""
