@@ -21,8 +21,7 @@ from bench.markers.outlines import LOOKS
 from bench.markers.sphere_conditions import CONDITIONS, Tally, places
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.detect import DETECTORS, Detector
-from service.compute.markers.grounded import GroundedDetector
-from service.compute.markers.grounded_networks import VARIABLE, load_networks, weights_in
+from service.compute.markers.grounded import VARIABLE, GroundedDetector, load_networks, weights_in
 from service.compute.markers.records import DEFAULTS
 from tests.support.scenes.sphere_conditions import Look, picture_of
 from tests.support.scenes.sphere_images import RADIUS_M, camera

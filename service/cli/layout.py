@@ -17,8 +17,7 @@ from service.computations.conversion import judged_layout
 from service.compute.images.photographs import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
 from service.compute.layout.moves import Move, suggest_moves
-from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph
-from service.compute.layout.photographs import layout_from_photographs
+from service.compute.layout.photographs import CALIBRATED, SpherePhotograph, layout_from_photographs
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.camera_files import read_camera_json, read_spheres_json
 from service.core.errors import ComputeError

@@ -40,7 +40,7 @@ from service.computations.detect_spheres.compute import detector_of, search_outl
 from service.compute.camera_model import read_camera_covariance
 from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for
-from service.compute.markers.grounded_networks import VARIABLE, weights_in
+from service.compute.markers.grounded import VARIABLE, weights_in
 from service.compute.markers.image_files import DetectFile, LocatedOutlines, search_nearby
 from service.compute.markers.paper import read_boxes
 from service.compute.markers.records import SphereOutline

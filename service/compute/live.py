@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import image_quality
-from service.compute.markers.edges import profiles, sample
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.rough import profiles, sample
 from service.compute.registration.hypotheses import paired
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.result import RegistrationResult

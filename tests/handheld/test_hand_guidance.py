@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.planning.hand_guidance import (
+from service.compute.hand_held import (
     Attitude,
     away_from_plane,
     covered,

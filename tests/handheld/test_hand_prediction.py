@@ -9,8 +9,7 @@ from service.computations import hand_view as job
 from service.computations.hand_view.answer import HandGuide, HandheldImage
 from service.computations.records import Camera, Limits
 from service.computations.scene import CaptureScene
-from service.compute.planning.coverage import CoverageLimits
-from service.compute.planning.next_views import predicted_information
+from service.compute.planning.coverage import CoverageLimits, predicted_information
 from service.core.geometry import apply, inverse
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, scene
 

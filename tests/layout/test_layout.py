@@ -18,8 +18,7 @@ from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import REQUIRED_MARGIN_M, check_layout
 from service.compute.layout.moves import Move, show_move, suggest_moves
-from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
-from service.compute.layout.photographs import layout_from_photographs
+from service.compute.layout.photographs import LensPrior, SpherePhotograph, layout_from_photographs
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse, transform

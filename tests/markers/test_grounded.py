@@ -15,15 +15,20 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.markers.detect import detect_spheres
-from service.compute.markers.grounded import LAST_THRESHOLD, GroundedDetector, find_boxes, normalised, tiles_of, voted
-from service.compute.markers.grounded_networks import (
+from service.compute.markers.grounded import (
     DEVIATION,
+    LAST_THRESHOLD,
     MEAN,
     VARIABLE,
     Floats,
+    GroundedDetector,
     Networks,
     Weights,
+    find_boxes,
     load_networks,
+    normalised,
+    tiles_of,
+    voted,
     weights_in,
 )
 from service.core.errors import ConfigurationError, DataError

@@ -15,13 +15,10 @@ from service.compute.markers.records import SphereOutline
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
-    coverage_surface,
-    covered_fraction,
-    seen,
-)
-from service.compute.planning.next_views import (
     CurrentInformation,
     ViewGain,
+    coverage_surface,
+    covered_fraction,
     lens_covariance_of_pose,
     mounting_covariance,
     next_best_views,
@@ -29,6 +26,7 @@ from service.compute.planning.next_views import (
     pose_covariance,
     pose_scatter,
     predicted_information,
+    seen,
     view_information,
 )
 from service.compute.registration.identity import Assignment

@@ -17,8 +17,7 @@ from service.computations.records import Hash, PosedPhotograph, has_poses
 from service.computations.structure_from_motion import ModelFile
 from service.compute.camera_model import CameraModel
 from service.compute.markers.detect import options_for
-from service.compute.markers.grounded import GroundedDetector
-from service.compute.markers.grounded_networks import Weights, weights_in
+from service.compute.markers.grounded import GroundedDetector, Weights, weights_in
 from service.compute.markers.image_files import (
     DetectFile,
     LocatedOutlines,

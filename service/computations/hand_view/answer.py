@@ -16,10 +16,8 @@ from service.computations.hand_view import HeldArguments, PlannedPlace
 from service.computations.job import JobAnswer, JobContext, finite
 from service.computations.records import Matrix, Point, matrices, matrix
 from service.computations.scene import CaptureScene
-from service.compute.hand_held import ImageReading
-from service.compute.live import expected_spheres
-from service.compute.planning.coverage import covered_fraction
-from service.compute.planning.hand_guidance import (
+from service.compute.hand_held import (
+    ImageReading,
     WantedView,
     covered,
     level_frame,
@@ -28,9 +26,11 @@ from service.compute.planning.hand_guidance import (
     same_view,
     words,
 )
-from service.compute.planning.next_views import (
+from service.compute.live import expected_spheres
+from service.compute.planning.coverage import (
     CurrentInformation,
     ViewGain,
+    covered_fraction,
     lens_covariance_of_pose,
     next_best_views,
     predicted_information,

@@ -13,10 +13,9 @@ from service.computations.conversion import camera_of
 from service.computations.hand_view.answer import HandheldImage, NewImage, answer_to, read_views
 from service.computations.job import JobAnswer, JobContext
 from service.computations.scene import CaptureScene, kept_surface, limits_of
-from service.compute.hand_held import HandView, ImageReading, adjust_together, look_at_image
+from service.compute.hand_held import HandView, ImageReading, adjust_together, away_from_plane, look_at_image
 from service.compute.images.photographs import read_image
 from service.compute.markers.detect import options_for
-from service.compute.planning.hand_guidance import away_from_plane
 from service.core.geometry import Array, Transform
 from service.core.units import mm
 

@@ -22,8 +22,7 @@ from service.compute.layout.ambiguity import (
     layout_measures,
 )
 from service.compute.layout.moves import PhotographedMove, innermost, show_move, suggest_moves
-from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
-from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
+from service.compute.layout.photographs import LensPrior, PhotoLayout, SpherePhotograph, layout_from_photographs
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
 from service.core.errors import ComputeError

@@ -11,8 +11,13 @@ from service.computations.job import JobAnswer, JobContext
 from service.computations.live_view.station import LiveRecord, LiveStation, last_known, read_records, solve_station
 from service.computations.scene import CaptureScene, live_scene
 from service.compute.live import expected_spheres
-from service.compute.planning.coverage import covered_fraction
-from service.compute.planning.next_views import CurrentInformation, ViewGain, next_best_views, predicted_information
+from service.compute.planning.coverage import (
+    CurrentInformation,
+    ViewGain,
+    covered_fraction,
+    next_best_views,
+    predicted_information,
+)
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse
 from service.core.units import mm

@@ -16,7 +16,7 @@ from service.computations.records import Hash
 from service.computations.scene import CaptureScene
 from service.compute.live import LiveView, ProvisionalRegistration, register_station
 from service.compute.markers.records import outline_from_record, outline_record
-from service.compute.planning.next_views import (
+from service.compute.planning.coverage import (
     ViewInformation,
     mounting_covariance,
     point_sigmas_m,

@@ -12,8 +12,8 @@ from service.computations.conversion import judged_layout, measured_sphere
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import LoopClosure as LoopClosureRecord
 from service.computations.records import SphereChange, SphereDetails, SpheresFound, matrix
+from service.compute.layout.ambiguity import SUBSET as LAYOUT_SUBSET
 from service.compute.layout.ambiguity import check_layout, layout_measures
-from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.surfaces.constellations import LoopClosure, close_loop, match_constellations
 from service.compute.surfaces.mesh_spheres import MeshSphere, wrong_unit
 from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres

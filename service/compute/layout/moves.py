@@ -13,8 +13,11 @@ from service.compute.layout.ambiguity import (
     REQUIRED_MARGIN_M,
     REQUIRED_MARGIN_OF_FIVE_M,
     check_layout,
+    confusions,
+    distances,
+    misfits,
+    similar,
 )
-from service.compute.layout.confusions import confusions, distances, misfits, similar
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply
 from service.core.units import mm

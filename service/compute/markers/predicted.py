@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, ObservedCones, cone_of_sphere, fit_pose, ransac_cone
 from service.compute.markers.detect import confirmed_outlines, detect_spheres, find_rough
-from service.compute.markers.edges import envelope_edges, profiles, sample
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.compute.markers.refine import AveragedCone, approach_outlines, measure_outlines, refine_outline
+from service.compute.markers.rough import envelope_edges, profiles, sample
 from service.compute.registration.hypotheses import MatchGate
 from service.core.geometry import Array, Transform, apply
 

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.images.develop import coded, read_developed
 from service.compute.markers.cones import Cone, distance_gradient, ransac_cone
-from service.compute.markers.edges import (
+from service.compute.markers.limb import LimbFit, LimbProfiles, fit_limb, masked_median
+from service.compute.markers.records import (
+    DEFAULTS,
+    DetectionOptions,
+    OutlineEvidence,
+    SphereOutline,
+    outline_from_cone,
+)
+from service.compute.markers.rough import (
     FINER,
     Pixels,
     envelope_edges,
@@ -21,14 +29,6 @@ from service.compute.markers.edges import (
     sample,
     sample_averaged,
     sample_sharp,
-)
-from service.compute.markers.limb import LimbFit, LimbProfiles, fit_limb, masked_median
-from service.compute.markers.records import (
-    DEFAULTS,
-    DetectionOptions,
-    OutlineEvidence,
-    SphereOutline,
-    outline_from_cone,
 )
 from service.core.errors import DataError
 from service.core.geometry import Array

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.compute.hand_held import HandView
-from service.compute.planning.next_views import ViewInformation
+from service.compute.planning.coverage import ViewInformation
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from simulators.hand.technician import Grip, follow

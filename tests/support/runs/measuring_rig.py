@@ -10,7 +10,7 @@ import trimesh
 
 from drivers.errors import DeviceFaultError
 from drivers.interfaces import CtSource, DeviceIdentity, DeviceReport, Mesh, ScanExport, ScannedMesh
-from service.compute.planning.next_views import ViewInformation, view_information
+from service.compute.planning.coverage import ViewInformation, view_information
 from service.compute.scene import ScanSpheres
 from service.core.geometry import Array, apply, transform
 from tests.support.rig.bench_rig import BenchRig

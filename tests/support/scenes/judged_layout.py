@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import check_layout, layout_bounds
-from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
-from service.compute.layout.photographs import layout_from_photographs
+from service.compute.layout.photographs import LensPrior, SpherePhotograph, layout_from_photographs
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
 from simulators.geometry import apply, inverse
 from simulators.rig.world_server import HELD_CAMERAS
