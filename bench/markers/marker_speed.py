@@ -28,8 +28,7 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.markers.image_files import ANCHOR_WIDTH_PX
 from service.compute.markers.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of
 from service.compute.markers.records import SphereOutline
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.pose_files import read_poses
+from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.core.geometry import inverse
 from tests.support.scenes.rendered_scene import rendered
 

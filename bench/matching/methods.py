@@ -14,7 +14,7 @@ from pathlib import Path
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from service.benchmark.matching import MatchingTask, run_matching
 from service.benchmark.matching_results import markdown, record
-from service.compute.matching.methods.method import matcher
+from service.compute.matching.methods import matcher
 
 _WORK = REPOSITORY / "build" / "bench" / "matching"
 

@@ -24,8 +24,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.pose_files import read_poses_csv
+from service.compute.poses.pose_files import read_camera_json, read_poses_csv, read_spheres_json
 from service.compute.registration.accuracy import true_error_m
 from service.compute.registration.problem import RegistrationSettings, residuals
 from service.compute.registration.result import with_joint_pose_covariance

@@ -26,8 +26,7 @@ from bench.machine import RESULTS, machine
 from service.compute.images.photographs import read_image
 from service.compute.markers.image_files import detect_all, locate_outlines
 from service.compute.pipeline import register_images
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.pose_files import read_poses
+from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.compute.scene import PosedImages, ScanSpheres
 from tests.support.scenes.rendered_scene import rendered
 

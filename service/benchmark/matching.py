@@ -13,7 +13,7 @@ from pydantic import FiniteFloat, TypeAdapter
 
 from service.benchmark.matching_results import MethodResult, markdown, read_result, result_of, write_result
 from service.compute.matching.loader import MatchingData, Pair
-from service.compute.matching.methods.method import Match, Matcher, Matches, Picture
+from service.compute.matching.methods import Match, Matcher, Matches, Picture
 from service.compute.matching.pairs import CLASSES
 from service.compute.matching.scores import (
     DAMAGED,

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
 from service.compute.matching.loader import MatchingData
-from service.compute.matching.methods.method import Matcher
+from service.compute.matching.methods import Matcher
 from service.compute.matching.pairs import CLASSES
 from service.compute.matching.scores import INLIER_PX, PRECISION_PX, THRESHOLDS_DEG, PairScore, PoseError, auc
 from service.core.errors import DataError

@@ -236,7 +236,7 @@ def matching_command(
             record,
             rows,
         )
-        from service.compute.matching.methods.method import matcher  # noqa: PLC0415
+        from service.compute.matching.methods import matcher  # noqa: PLC0415
 
         how = matcher(method)
         require_writable_folder(out)

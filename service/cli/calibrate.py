@@ -49,8 +49,7 @@ from service.compute.calibration.next_poses import SuggestedPose, draw_board_pla
 from service.compute.calibration.reprojection import BoardCorners, board_corners
 from service.compute.camera_model import CameraModel, read_camera_covariance
 from service.compute.images.photographs import ImageFolder, image_folder
-from service.compute.poses.camera_files import read_camera_json
-from service.compute.poses.pose_files import only_posed, posed_images
+from service.compute.poses.pose_files import only_posed, posed_images, read_camera_json
 from service.compute.poses.robot_files import (
     RobotPoseTable,
     RotationForm,

@@ -21,8 +21,7 @@ from service.cli.common import (
     require_writable_folder,
     tell_left_out,
 )
-from service.compute.poses.camera_files import write_camera_json
-from service.compute.poses.pose_files import write_poses_csv
+from service.compute.poses.pose_files import write_camera_json, write_poses_csv
 from service.compute.poses.ros_messages import StampedImage, StampedTransform
 from service.compute.poses.ros_recording import (
     FoundPose,

@@ -19,7 +19,7 @@ from service.compute.layout.ambiguity import LayoutReport, check_layout
 from service.compute.layout.moves import Move, suggest_moves
 from service.compute.layout.photographs import CALIBRATED, SpherePhotograph, layout_from_photographs
 from service.compute.markers.detect import detect_spheres
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.pose_files import read_camera_json, read_spheres_json
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import metres, mm

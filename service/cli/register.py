@@ -45,8 +45,7 @@ from service.compute.markers.image_files import DetectFile, LocatedOutlines, sea
 from service.compute.markers.paper import read_boxes
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, register_images
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json
-from service.compute.poses.pose_files import posed_images
+from service.compute.poses.pose_files import posed_images, read_camera_json, read_spheres_json
 from service.compute.registration.control_spheres import LEAST_SHARE, ExpectedNearby
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError

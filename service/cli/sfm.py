@@ -40,8 +40,13 @@ from service.cli.scheduler import (
 from service.compute.camera_model import CameraCovariance, read_camera_covariance
 from service.compute.images.photographs import image_folder
 from service.compute.markers.image_files import detect_all
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
-from service.compute.poses.pose_files import read_poses_csv, write_poses_csv
+from service.compute.poses.pose_files import (
+    read_camera_json,
+    read_poses_csv,
+    read_spheres_json,
+    write_camera_json,
+    write_poses_csv,
+)
 from service.compute.poses.robot_files import read_hand_eye, read_stations
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, write_pose_covariance

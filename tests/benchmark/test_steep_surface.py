@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.render import RayMesh
-from service.compute.stereo.rectify import StereoView
+from service.compute.stereo.matching import StereoView
 from service.compute.stereo.steep import (
     averaged,
     beliefs,

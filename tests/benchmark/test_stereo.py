@@ -11,9 +11,15 @@ from service.benchmark.methods import methods, missing
 from service.benchmark.running import Trial, run_trial
 from service.compute.camera_model import CameraModel
 from service.compute.images.render import RayMesh
-from service.compute.stereo.fusion import fused, surface_of
-from service.compute.stereo.matching import depth_of_pair, guided_depth
-from service.compute.stereo.rectify import StereoView, looked_at_m, rectified, stereo_pairs
+from service.compute.stereo.matching import (
+    StereoView,
+    depth_of_pair,
+    guided_depth,
+    looked_at_m,
+    rectified,
+    stereo_pairs,
+)
+from service.compute.stereo.reconstruct import fused, surface_of
 from service.compute.surfaces.chamfer import ChamferSettings
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at

@@ -17,7 +17,7 @@ from service.cli.main import app
 from service.compute.calibration.board import Board
 from service.compute.camera_model import CameraModel
 from service.compute.photography import Optics, compare_optics
-from service.compute.poses.camera_files import read_camera_json
+from service.compute.poses.pose_files import read_camera_json
 from service.core.errors import DataError
 from service.core.geometry import transform
 from service.core.protocol import load_protocol

@@ -24,7 +24,7 @@ from service.cli.main import app
 from service.cli.operators import Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.computations import term
-from service.compute.matching.methods.method import matchers
+from service.compute.matching.methods import matchers
 from service.core.protocol import irreversible_warning, load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.exporter import exporters

@@ -16,8 +16,8 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.render import RayMesh
 from service.compute.sfm.front_end import FrontEnd
 from service.compute.sfm.options import SfmOptions
-from service.compute.stereo.depth_maps import depth_maps, stored_views
-from service.compute.stereo.rectify import StereoView, looked_at_m, stereo_pairs
+from service.compute.stereo.matching import StereoView, looked_at_m, stereo_pairs
+from service.compute.stereo.reconstruct import depth_maps, stored_views
 from service.dataset.exporter import Progress, exporter, write_data_set
 from service.machine.executors import noting_places
 from tests.support.processes.cluster import Cluster, bits, on

@@ -39,7 +39,7 @@ EDGES = {
     "service/compute/hand_held.py": "writes and reads the file of a hand-held image",
     "service/compute/markers/records.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
-    "service/compute/poses/camera_files.py": "reads JSON files",
+    "service/compute/poses/pose_files.py": "reads JSON files",
     "service/core/protocol.py": "the JSON schema of a protocol",
     "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",

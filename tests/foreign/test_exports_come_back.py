@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from service.cli.import_ros import keep_image
 from service.cli.main import app
-from service.compute.poses.camera_files import read_camera_json
-from service.compute.poses.pose_files import read_poses
+from service.compute.poses.pose_files import read_camera_json, read_poses
 from service.compute.poses.ros_messages import StampedImage
 from service.dataset.formats.hdf5 import data_set_of_folder
 from service.dataset.formats.mcap import stamps_ns

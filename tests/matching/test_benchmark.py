@@ -17,7 +17,7 @@ from service.benchmark.matching_results import read_result, record
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.matching.loader import MatchingData
-from service.compute.matching.methods.method import GROUP
+from service.compute.matching.methods import GROUP
 from service.core.geometry import Array
 from service.dataset.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set
@@ -28,7 +28,7 @@ _GRID_M, _FROM_M = (0.0025, 0.006), -0.15
 #: Knows nothing but the pictures, as every method: it says so if it can find more.
 PLUGIN = """
 import numpy as np
-from service.compute.matching.methods.method import Matcher, Matches
+from service.compute.matching.methods import Matcher, Matches
 
 def run(first, second):
     assert first.dtype == second.dtype == np.uint8 and first.ndim == 3

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.matching.methods.method import GROUP, Picture, matcher, matchers
+from service.compute.matching.methods import GROUP, Picture, matcher, matchers
 from service.core.errors import ConfigurationError, DataError
 
 # As much of PyTorch and kornia as the adapters use. LoFTR finds everything 8 px to the right and 4 px lower, in its
@@ -111,7 +111,7 @@ def test_the_methods_are_found() -> None:
 def test_a_plug_in_in_one_file_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "still_matcher.py").write_text(
         "import numpy as np\n"
-        "from service.compute.matching.methods.method import Matcher, Matches\n"
+        "from service.compute.matching.methods import Matcher, Matches\n"
         "def still(first, second):\n"
         "    corners = np.array([[0.0, 0.0], [first.shape[1] - 1.0, 0.0]])\n"
         "    return Matches(corners, corners, np.ones(2))\n"

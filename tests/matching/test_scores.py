@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.images.render import RayMesh, depth_map
 from service.compute.matching.loader import VISIBLE, View, correspondences
-from service.compute.matching.methods.method import Matches
+from service.compute.matching.methods import Matches
 from service.compute.matching.pairs import relative_pose
 from service.compute.matching.scores import (
     PRECISION_PX,

@@ -16,8 +16,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
-from service.compute.poses.pose_files import read_poses, write_poses_csv, write_transforms_json
+from service.compute.poses.pose_files import (
+    read_camera_json,
+    read_poses,
+    read_spheres_json,
+    write_camera_json,
+    write_poses_csv,
+    write_transforms_json,
+)
 from service.compute.sfm.estimate import write_pose_covariance
 from service.core.errors import DataError
 from service.core.geometry import Transform, transform

@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
-from service.compute.poses.camera_files import write_camera_json
-from service.compute.poses.pose_files import read_colmap_model, write_poses_csv
+from service.compute.poses.pose_files import read_colmap_model, write_camera_json, write_poses_csv
 from service.core.geometry import Transform, align_points, apply, inverse, look_at
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
-from service.compute.poses.camera_files import write_camera_json
+from service.compute.poses.pose_files import write_camera_json
 from service.core.geometry import inverse
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene

@@ -21,8 +21,7 @@ from typer.testing import CliRunner, Result
 from service.cli.common import shipped_protocols
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
-from service.compute.poses.camera_files import write_camera_json
-from service.compute.poses.pose_files import write_poses_csv, write_transforms_json
+from service.compute.poses.pose_files import write_camera_json, write_poses_csv, write_transforms_json
 from service.core.geometry import apply, inverse
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene

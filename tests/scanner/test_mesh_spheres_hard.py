@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.main import app
-from service.compute.poses.camera_files import read_spheres_json
+from service.compute.poses.pose_files import read_spheres_json
 from service.compute.surfaces.constellations import close_loop, match_constellations
 from service.compute.surfaces.mesh_spheres import MeshSphere, locate_spheres
 from service.core.errors import ComputeError

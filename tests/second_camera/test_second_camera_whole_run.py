@@ -18,8 +18,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.camera_files import read_camera_json
-from service.compute.poses.pose_files import read_poses_csv
+from service.compute.poses.pose_files import read_camera_json, read_poses_csv
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
 from service.core.records.run_events import JobFinished, ViewpointCaptured
 from service.dataset.summary import summarise

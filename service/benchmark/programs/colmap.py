@@ -15,7 +15,7 @@ import pycolmap
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_grey
 from service.compute.poses.pose_files import HALF_PIXEL
-from service.compute.stereo.rectify import StereoView
+from service.compute.stereo.matching import StereoView
 from service.core.errors import ComputeError, DataError, OrthocaptureError
 from service.core.geometry import transform
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from service.benchmark.programs.colmap import views_of
 from service.compute.images.photographs import read_image
 from service.compute.poses.pose_files import HALF_PIXEL
-from service.compute.stereo.fusion import fused, surface_of
-from service.compute.stereo.matching import DepthMap
-from service.compute.stereo.rectify import StereoView
+from service.compute.stereo.matching import DepthMap, StereoView
+from service.compute.stereo.reconstruct import fused, surface_of
 from service.compute.surfaces.surface import write_ply
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, inverse

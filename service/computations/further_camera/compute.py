@@ -17,7 +17,7 @@ from service.compute.markers.detect import options_for
 from service.compute.markers.image_files import detect_all
 from service.compute.markers.records import SphereOutline, outline_from_record, outline_record
 from service.compute.markers.refine import remeasure_file
-from service.compute.poses.camera_files import read_camera_json
+from service.compute.poses.pose_files import read_camera_json
 from service.compute.registration.further_camera import (
     FurtherPose,
     OuterFrame,

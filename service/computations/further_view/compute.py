@@ -12,7 +12,7 @@ from service.compute.images.photographs import read_image_of
 from service.compute.live import expected_spheres, image_measures
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import outline_record
-from service.compute.poses.camera_files import read_camera_json
+from service.compute.poses.pose_files import read_camera_json
 from service.compute.registration.further_camera import sighted_pose
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.images.photographs import read_image
 from service.compute.matching.loader import OCCLUDED, OUTSIDE, UNKNOWN, MatchingData, Pair, View, correspondences
-from service.compute.matching.methods.method import Match, Matches, Picture
+from service.compute.matching.methods import Match, Matches, Picture
 from service.compute.matching.pairs import CLASSES
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, skew

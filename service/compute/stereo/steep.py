@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
 from service.compute.images.render import RayMesh
-from service.compute.stereo.rectify import StereoView
+from service.compute.stereo.matching import StereoView
 from service.compute.surfaces.surface import PointIndex, Surface
 from service.core.geometry import Array, apply, inverse
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from service.compute.poses.camera_files import write_camera_json
-from service.compute.poses.pose_files import write_poses_csv, write_transforms_json
+from service.compute.poses.pose_files import write_camera_json, write_poses_csv, write_transforms_json
 from service.dataset.export_folder import ExportFolder
 from service.dataset.exporter import Exporter, ground_truth_ply
 from service.dataset.formats.colmap import write_images

@@ -16,7 +16,7 @@ from service.computations.records import Matrix, SpheresFound
 from service.computations.register import Registration
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_from_record
-from service.compute.poses.camera_files import read_camera_json
+from service.compute.poses.pose_files import read_camera_json
 from service.compute.registration.hypotheses import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs import jobs_of

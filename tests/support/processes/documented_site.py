@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from service.compute.poses.camera_files import write_camera_json
-from service.compute.poses.pose_files import write_poses_csv
+from service.compute.poses.pose_files import write_camera_json, write_poses_csv
 from service.core.records.run_events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store

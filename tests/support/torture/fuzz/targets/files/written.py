@@ -16,8 +16,15 @@ from service.computations.kind import read_part
 from service.computations.records import Mounting
 from service.compute.camera_model import CameraModel
 from service.compute.markers.paper import read_boxes
-from service.compute.poses.camera_files import read_camera_json, read_spheres_json, write_camera_json
-from service.compute.poses.pose_files import read_colmap_model, read_poses, write_poses_csv, write_transforms_json
+from service.compute.poses.pose_files import (
+    read_camera_json,
+    read_colmap_model,
+    read_poses,
+    read_spheres_json,
+    write_camera_json,
+    write_poses_csv,
+    write_transforms_json,
+)
 from service.compute.poses.robot_files import read_hand_eye, read_joints_csv, read_stations
 from service.core.geometry import Transform
 from service.core.protocol import parse_protocol
@@ -237,14 +244,14 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "camera_json",
-        "service.compute.poses.camera_files:read_camera_json",
+        "service.compute.poses.pose_files:read_camera_json",
         lambda data, folder: read_camera_json(_put(folder, "camera.json", data)),
         _cameras,
         JSON,
     ),
     Target(
         "spheres_json",
-        "service.compute.poses.camera_files:read_spheres_json",
+        "service.compute.poses.pose_files:read_spheres_json",
         lambda data, folder: read_spheres_json(_put(folder, "spheres.json", data)),
         _spheres,
         JSON,

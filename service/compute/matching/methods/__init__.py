@@ -1,1 +1,0 @@
-"""Methods of feature matching, one file each."""
