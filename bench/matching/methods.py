@@ -12,8 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from service.benchmark.matching import MatchingTask, run_matching
-from service.benchmark.matching_results import markdown, record
+from service.benchmark.matching import MatchingTask, markdown, record, run_matching
 from service.compute.matching.methods import matcher
 
 _WORK = REPOSITORY / "build" / "bench" / "matching"

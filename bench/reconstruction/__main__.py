@@ -15,9 +15,9 @@ from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS
 from service.benchmark.methods import method_named, methods
-from service.benchmark.records import SCENARIOS, read_results
 from service.benchmark.running import Trial, run_trial
 from service.benchmark.table import figure_png, table_markdown
+from service.computations.benchmark import SCENARIOS, read_results
 from tests.support.scenes.rendered_scene import CACHE, render_scene
 from tests.support.scenes.simulated_data_set import simulated_data_set
 

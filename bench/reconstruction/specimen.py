@@ -16,8 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from service.benchmark.records import read_results
-from service.computations.benchmark import BenchmarkResult, Score
+from service.computations.benchmark import BenchmarkResult, Score, read_results
 from tests.support.scenes.rendered_scene import CACHE, render_scene
 from tests.support.scenes.simulated_data_set import simulated_data_set
 from tests.support.scenes.specimen import markers_of, score_specimen

@@ -116,7 +116,7 @@ def arguments(folder: Path, name: str) -> dict[str, Any]:
 
 def score(folder: Path) -> JobAnswer:
     """Score a mesh against the fused one as a benchmark does: the same with noise."""
-    from service.benchmark.scoring import score_mesh, write_scored  # noqa: PLC0415 - loads much that jobs do not need
+    from service.benchmark.running import score_mesh, write_scored  # noqa: PLC0415 - loads much that jobs do not need
     from service.dataset.records import Mesh  # noqa: PLC0415
 
     columns, faces = read_ply(folder / "ground_truth.ply")

@@ -1,7 +1,8 @@
-"""Declares the methods of reconstruction: the format that each reads, its commands, and where its mesh comes from."""
+"""Declares the methods of reconstruction: their format, commands and mesh, and which version is installed."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import os
@@ -10,16 +11,50 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
-from service.benchmark.versions import commit_in, first_line, of_packages
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.loading import declared_kinds, kind_named
+
+_ANSWER_S = 120.0
+
+
+def of_packages(*names: str) -> Callable[[], str]:
+    """Return a function that gives the versions of those of these distributions that are installed."""
+
+    def versions() -> str:
+        found: list[str] = []
+        for name in names:
+            with contextlib.suppress(PackageNotFoundError):
+                found.append(f"{name} {version(name)}")
+        return ", ".join(found)
+
+    return versions
+
+
+def commit_in(variable: str) -> Callable[[], str]:
+    """Return a function that gives the commit of the source folder that an environment variable names."""
+
+    def head() -> str:
+        return first_line("git", "-C", os.environ.get(variable, ""), "rev-parse", "HEAD")
+
+    return head
+
+
+def first_line(*command: str) -> str:
+    """Return the first line that a program prints; "" if it does not answer."""
+    try:
+        printed = subprocess.run(command, capture_output=True, text=True, timeout=_ANSWER_S, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return next(iter(printed.stdout.strip().splitlines()), "")
+
 
 GROUP = "orthocapture.reconstruction_methods"
 Command = tuple[str, ...]

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.benchmark.running import OUTPUT, write_result, write_truth
-from service.benchmark.scoring import HEAT_MAP, SCORED
+from service.benchmark.running import HEAT_MAP, OUTPUT, SCORED, write_result, write_truth
 from service.computations.benchmark import (
     HEAT_MAPS,
     KIND,

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import Method, Workplace, missing
-from service.benchmark.records import SCENARIOS
 from service.benchmark.running import truth_file
-from service.computations.benchmark import BenchmarkResult, Scenario
+from service.computations.benchmark import SCENARIOS, BenchmarkResult, Scenario
 from service.compute.surfaces.chamfer import OUTLIER_M, DistanceSamples, sample
 from service.compute.surfaces.heat_map import HeatScale, Panel, heat_bar, heat_row
 from service.compute.surfaces.surface import PointIndex, Surface

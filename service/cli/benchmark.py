@@ -188,12 +188,12 @@ def table_command(
     with reporting_errors(json):
         # These load the numerics, which take seconds.
         from service.benchmark.methods import methods  # noqa: PLC0415
-        from service.benchmark.records import read_results  # noqa: PLC0415
         from service.benchmark.table import (  # noqa: PLC0415
             figure_png,
             table_markdown,
             table_record,
         )
+        from service.computations.benchmark import read_results  # noqa: PLC0415
 
         results, known = read_results(out), methods()
         text = table_markdown(results, known)
@@ -230,12 +230,7 @@ def matching_command(
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         # These load the numerics, which take seconds.
-        from service.benchmark.matching import MatchingTask, run_matching  # noqa: PLC0415
-        from service.benchmark.matching_results import (  # noqa: PLC0415
-            HEADER,
-            record,
-            rows,
-        )
+        from service.benchmark.matching import HEADER, MatchingTask, record, rows, run_matching  # noqa: PLC0415
         from service.compute.matching.methods import matcher  # noqa: PLC0415
 
         how = matcher(method)

@@ -1,21 +1,27 @@
-"""The one seam of what is parallel inside a job: a map over an executor, of local processes or of what was chosen."""
+"""The one seam of what is parallel inside a job: a map over an executor; and calls in a child process with limits."""
 
 from __future__ import annotations
 
 import importlib
 import multiprocessing
 import os
+import resource
 import socket
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
+from math import ceil
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
+
+import psutil
 
 from service.logs import show_own_words_only
 from service.machine.resources import processor_model
@@ -225,3 +231,47 @@ def noting_places() -> Generator[Counter[Place]]:
 def noted_places() -> Counter[Place]:
     """Return the count of the block around; one that nobody reads if there is none."""
     return noted if (noted := _noted.get()) is not None else Counter()
+
+
+@dataclass(frozen=True, slots=True)
+class ChildLimits:
+    """Limits what a child may take, besides what it has when its modules are imported.
+
+    Attributes:
+        memory_bytes: the memory.
+        processor_s: the processor time.
+    """
+
+    memory_bytes: int
+    processor_s: float
+
+
+class ChildEndedError(Exception):
+    """The child was ended: it crashed, or reached its limit of processor time."""
+
+
+def call_in_child(work: Callable[..., _Result], *arguments: object, module: str, limits: ChildLimits) -> _Result:
+    """Return what `work` returns in a process of its own, which imports `module` first.
+
+    Raises:
+        ChildEndedError: the child crashed or took too long.
+        MemoryError: it wanted more memory than its limit.
+    """
+    context = multiprocessing.get_context("spawn")
+    try:
+        with ProcessPoolExecutor(1, mp_context=context, initializer=_limited, initargs=(module, limits)) as pool:
+            return pool.submit(work, *arguments).result()
+    except BrokenProcessPool as error:
+        raise ChildEndedError from error
+
+
+def _limited(module: str, limits: ChildLimits) -> None:
+    show_own_words_only()
+    importlib.import_module(module)
+    _lower(resource.RLIMIT_AS, psutil.Process().memory_info().vms + limits.memory_bytes)
+    _lower(resource.RLIMIT_CPU, ceil(time.process_time() + limits.processor_s))
+
+
+def _lower(what: int, limit: int) -> None:
+    _, most = resource.getrlimit(what)
+    resource.setrlimit(what, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))

@@ -15,10 +15,9 @@ import pytest
 import trimesh
 
 from service.benchmark.methods import Workplace, methods, missing
-from service.benchmark.records import read_results
 from service.benchmark.running import Trial, run_trial
 from service.benchmark.table import figure_png, table_markdown, table_record
-from service.computations.benchmark import BenchmarkResult
+from service.computations.benchmark import BenchmarkResult, read_results
 from service.compute.surfaces.chamfer import ChamferSettings
 from service.core.errors import ComputeError, ConfigurationError, DataError, OrthocaptureError
 from service.core.geometry import apply, inverse

@@ -41,7 +41,7 @@ EDGES = {
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",
     "service/compute/poses/pose_files.py": "reads JSON files",
     "service/core/protocol.py": "the JSON schema of a protocol",
-    "service/benchmark/matching_results.py": "writes a result of the benchmark of matching",
+    "service/benchmark/matching.py": "writes a result of the benchmark of matching",
     "service/benchmark/table.py": "writes the table of a benchmark",
     "service/dataset/crate.py": "writes ro-crate-metadata.json",
     "service/dataset/descriptions.py": "writes croissant.json",

@@ -13,7 +13,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 from typer.testing import CliRunner
 
-from service.benchmark.matching_results import read_result, record
+from service.benchmark.matching import read_result, record
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.matching.loader import MatchingData

@@ -1,15 +1,19 @@
 """Job kind `benchmark`: runs a method of reconstruction on the run's data set, and compares its mesh with the truth.
 
 The computation stands upon the data set and the methods, which know the other kinds by their declarations: it is the
-one that imports upper rooms (decision 30).
+one that imports upper rooms (decision 30). Its results are stored as JSON, one file for each method and scenario.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
+
+from pydantic import ValidationError
 
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import Hash
+from service.core.errors import DataError
 from service.core.units import megabytes
 
 Scenario = Literal["dense", "sparse"]
@@ -154,6 +158,25 @@ def _unrepeatable(answer: BenchmarkResult) -> str:
     if answer.random:
         return f"{answer.method} makes another mesh each time, so that there is nothing to compare"
     return "" if answer.score is not None else f"{answer.method} made no mesh, so that there is nothing to compare"
+
+
+RESULT = "result.json"
+SCENARIOS: tuple[Scenario, ...] = ("dense", "sparse")
+
+
+def read_results(out: Path) -> tuple[BenchmarkResult, ...]:
+    """Read all results in a folder, by name of their folders.
+
+    Raises:
+        DataError: a file is not a result.
+    """
+    results: list[BenchmarkResult] = []
+    for path in sorted(out.glob(f"*/{RESULT}")):
+        try:
+            results.append(BenchmarkResult.model_validate_json(path.read_bytes()))
+        except ValidationError as error:
+            raise DataError("this is not a result of the benchmark", where=str(path), remedy="Remove it") from error
+    return tuple(results)
 
 
 KIND = JobKind(

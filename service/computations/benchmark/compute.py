@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from service.benchmark.methods import method_named, place_of
 from service.benchmark.recorded import data_set_of_record
-from service.benchmark.running import OUTPUT, Trial, run_trial
-from service.benchmark.scoring import HEAT_MAP, SCORED
+from service.benchmark.running import HEAT_MAP, OUTPUT, SCORED, Trial, run_trial
 from service.computations.benchmark import HEAT_MAPS, MESH, PRINTED, SCORED_MESH, Arguments
 from service.computations.job import JobAnswer, JobContext
 from service.compute.surfaces.chamfer import ChamferSettings

@@ -19,7 +19,7 @@ from typing import Any, Self, cast
 from service.compute.sfm.options import Progress
 from service.core.errors import ComputeError, DataError, OrthocaptureError
 from service.core.geometry import Transform
-from service.machine.processes import ChildEndedError, ChildLimits, call_in_child
+from service.machine.executors import ChildEndedError, ChildLimits, call_in_child
 
 _END_S = 1.0  # that an idle child may take to end itself
 

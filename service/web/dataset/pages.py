@@ -13,8 +13,7 @@ from fastapi import Path as UrlPath
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
 from service.audit.background import ChildProcesses, ChildState
-from service.benchmark.records import SCENARIOS, read_results
-from service.computations.benchmark import KIND, BenchmarkResult
+from service.computations.benchmark import KIND, SCENARIOS, BenchmarkResult, read_results
 from service.core.errors import DataError, IntegrityError
 from service.core.gates import refuse_data_set
 from service.core.records.events import Event

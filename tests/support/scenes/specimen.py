@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.meshes.surface_file import read_surface_file
-from service.benchmark.scoring import compare
+from service.benchmark.running import compare
 from service.computations.benchmark import Score
 from service.compute.surfaces.fuse import Markers, compact
 from service.compute.surfaces.surface import Surface

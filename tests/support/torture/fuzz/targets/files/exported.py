@@ -12,12 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from service.audit.export.wanted import ExportRequest, WantedExport, keep_request, kept_request
-from service.benchmark.matching import open_matching_data, results_in
-from service.benchmark.matching_results import MethodResult, markdown, read_result, write_result
+from service.benchmark.matching import (
+    MethodResult,
+    markdown,
+    open_matching_data,
+    read_result,
+    results_in,
+    write_result,
+)
 from service.benchmark.methods import from_unit_box, methods
-from service.benchmark.records import RESULT, read_results
 from service.benchmark.table import table_markdown
-from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
+from service.computations.benchmark import RESULT, BenchmarkResult, ComputingEffort, Machine, Score, read_results
 from service.compute.matching.scores import PRECISION_PX, LoadedViews, PairScore, PoseError
 from service.compute.surfaces.surface import Surface, read_ply, write_ply
 from service.core.text_files import parse_json
@@ -219,9 +224,9 @@ TARGETS: tuple[Target, ...] = (
         )
     ),
     Target(
-        "matching_result", "service.benchmark.matching_results:read_result", _matching_result, _matching_results, JSON
+        "matching_result", "service.benchmark.matching:read_result", _matching_result, _matching_results, JSON
     ),
-    Target("benchmark_result", "service.benchmark.records:read_results", _result, _results, JSON),
+    Target("benchmark_result", "service.computations.benchmark:read_results", _result, _results, JSON),
     Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
     Target("own_ply", "service.compute.surfaces.surface:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview_records:read_preview", _preview, _previews, JSON),
