@@ -30,9 +30,11 @@ import psutil
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.job_memory import RADIUS_M, SCENE, Folder
-from service.computations import develop, features, match, merge_scans
+from service.computations.further_cameras import DEVELOP
+from service.computations.image_poses import FEATURES, MATCH
 from service.computations.job import JobContext, RecordedContext, handler_of
 from service.computations.kind import JobKind
+from service.computations.scans import MERGE_SCANS
 from service.compute.photography import PARAMETERS
 from service.core.units import megabytes
 from service.machine.resources import keep_freed_memory
@@ -45,9 +47,7 @@ from simulators.still_camera.raw_file import encode_raw
 
 CACHE = REPOSITORY / "build" / "bench" / "image_job_memory"
 WIDTH, HEIGHT = 9504, 6336
-KINDS: dict[str, JobKind[Any, Any]] = {
-    kind.name: kind for kind in (develop.KIND, features.KIND, match.KIND, merge_scans.KIND)
-}
+KINDS: dict[str, JobKind[Any, Any]] = {kind.name: kind for kind in (DEVELOP, FEATURES, MATCH, MERGE_SCANS)}
 _CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": 11000.0, "fy": 11000.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
 _SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100)
 

@@ -32,8 +32,10 @@ from typing import Any
 import numpy as np
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
-from service.computations import coverage_points, ct_surface, fuse, locate_spheres
+from service.computations import fuse
 from service.computations.job import JobAnswer, JobContext, RecordedContext, handler_of
+from service.computations.live import COVERAGE_POINTS
+from service.computations.scans import CT_SURFACE, LOCATE_SPHERES
 from service.compute.surfaces.surface import Surface, read_ply
 from service.core.records.base import ArtefactRef
 from service.core.units import metres
@@ -45,7 +47,7 @@ from simulators.scene.world import Scene
 
 CACHE = REPOSITORY / "build" / "bench" / "job_memory"
 SCENE, RADIUS_M, THRESHOLD_HU = 7, 0.015, -450
-KINDS = {kind.name: kind for kind in (ct_surface.KIND, coverage_points.KIND, locate_spheres.KIND, fuse.KIND)}
+KINDS = {kind.name: kind for kind in (CT_SURFACE, COVERAGE_POINTS, LOCATE_SPHERES, fuse.KIND)}
 SCORING = "benchmark scoring"
 
 

@@ -20,10 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
 from service.cli.demo import true_cameras
-from service.computations import register as job
 from service.computations.conversion import camera_used, lens_covariance
-from service.computations.detect_spheres.compute import read_outlines
-from service.computations.inputs import robot_camera_poses
+from service.computations.inputs import read_outlines, robot_camera_poses
+from service.computations.registration import REGISTER, RegisterArguments
 from service.compute.camera_model import CameraModel
 from service.compute.pipeline import register_images
 from service.compute.registration.problem import RegistrationSettings
@@ -67,17 +66,17 @@ def measured(folder: Path, most_images: int) -> dict[str, Any]:
     }
 
 
-def _arguments(summary: RunSummary) -> job.Arguments:
+def _arguments(summary: RunSummary) -> RegisterArguments:
     """Of the run's first registration with corrected robot poses: that of the scan."""
     jobs = jobs_of(summary.state)
     for one in jobs.values():
-        if one.kind == job.KIND.name and job.KIND.read_answer(one.result).poses == "robot_corrected":
-            return job.KIND.read_arguments(one.arguments, jobs)
+        if one.kind == REGISTER.name and REGISTER.read_answer(one.result).poses == "robot_corrected":
+            return REGISTER.read_arguments(one.arguments, jobs)
     raise ValueError(f"the run {summary.run_id} has no registration with corrected robot poses")
 
 
 def _registered(
-    arguments: job.Arguments, outlines: Mapping[str, Any], true: Mapping[str, Array], T_world_scan: Array
+    arguments: RegisterArguments, outlines: Mapping[str, Any], true: Mapping[str, Array], T_world_scan: Array
 ) -> dict[str, float]:
     images, camera = arguments.images, camera_used(arguments)
     stations = sorted({image.station for image in images})
@@ -131,7 +130,7 @@ def _aligned(poses: Array, point_m: Array) -> Array:
     return np.hstack(parts)
 
 
-def _lens_chi2(arguments: job.Arguments, truth: Mapping[str, float]) -> float | None:
+def _lens_chi2(arguments: RegisterArguments, truth: Mapping[str, float]) -> float | None:
     """The calibration's squared error in the metric of its covariance, per parameter."""
     covariance = lens_covariance(arguments.intrinsics_covariance)
     if covariance is None:

@@ -11,7 +11,7 @@ from service.computations.kind import JobRecord
 _HEAD = """\
 Made from the code by `make reference`.
 
-A job is one computation of a worker. Each kind is declared in one folder of `service/computations`, or in a plug-in
+A job is one computation of a worker. Each kind is declared in a folder of `service/computations`, or in a plug-in
 (entry points `orthocapture.jobs`). What a job took from an earlier one stands in its arguments as a reference,
 `{"$from": {"job": "…", "field": "result/camera"}}`; what it took from all earlier ones of a kind as `{"$each": …}`.
 """

@@ -62,9 +62,12 @@ def _result_table(kind: StepKind[Any]) -> list[str]:
     A job's whole answer is described under the name of its kind.
     """
     held = [get_args(field.annotation) or (field.annotation,) for field in kind.result.model_fields.values()]
-    jobs = [name for name, job in job_kinds().items() if any(job.answer in records for records in held)]
     lines = [line.replace("](#", "](jobs.md#") for line in field_table(kind.result)]
-    return [line.replace("jobs.md#answer", f"jobs.md#{jobs[0]}") for line in lines] if jobs else lines
+    for name, job in job_kinds().items():
+        if any(job.answer in records for records in held):
+            place = f"](jobs.md#{job.answer.__name__.lower()})"
+            lines = [line.replace(place, f"](jobs.md#{name})") for line in lines]
+    return lines
 
 
 def _unique_headings(text: str) -> str:

@@ -34,7 +34,7 @@ from service.cli.intrinsics import (
     intrinsics_command,
     searched,
 )
-from service.computations.calibrate.records import BoardSeen, HandEye
+from service.computations.calibration import BoardSeen, HandEye
 from service.computations.conversion import hand_eye_record, seen_board
 from service.computations.kind import JobRecord
 from service.computations.records import Matrix, matrix

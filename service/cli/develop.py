@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder, write_whole
-from service.computations.develop.compute import DevelopedFile, develop_file
+from service.computations.further_cameras.compute import DevelopedFile, develop_file
 from service.compute.photography import PARAMETERS
 from service.core.errors import ConfigurationError, DataError
 

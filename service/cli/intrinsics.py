@@ -23,8 +23,8 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
-from service.computations.calibrate.compute import CalibratedCamera, calibrate_camera
-from service.computations.calibrate.records import Intrinsics
+from service.computations.calibration import Intrinsics
+from service.computations.calibration.compute import CalibratedCamera, calibrate_camera
 from service.compute.calibration.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
 from service.compute.calibration.board_search import UsableViews, find_boards, probe_board, usable_views
 from service.compute.calibration.intrinsics import IntrinsicsResult

@@ -35,8 +35,8 @@ from service.cli.scheduler import (
     reached_scheduler,
 )
 from service.cli.spheres import SeedsOption, spheres_of
-from service.computations.detect_spheres import DetectorName
-from service.computations.detect_spheres.compute import detector_of, search_outlines
+from service.computations.registration import DetectorName
+from service.computations.registration.compute import detector_of, search_outlines
 from service.compute.camera_model import read_camera_covariance
 from service.compute.images.photographs import image_folder
 from service.compute.markers.detect import options_for

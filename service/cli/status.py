@@ -18,7 +18,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.terminal_output import listed
-from service.computations import live_summary, live_view
+from service.computations.live import LIVE_SUMMARY, LIVE_VIEW, Suggestion
 from service.core.gates import Standing, describe, standing
 from service.core.records.entered import about_rows
 from service.core.records.run_events import GateVerdict
@@ -85,7 +85,7 @@ def status_command(
         console.print(f"{name}: {entered}")
     for coat in aging:
         console.print(f"{coat.title} {coat.text}")
-    live = [job for job in state.step.jobs.values() if job.kind == live_view.KIND.name and job.status != "enqueued"]
+    live = [job for job in state.step.jobs.values() if job.kind == LIVE_VIEW.name and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(describe_view(job))
     for one in computing:
@@ -139,9 +139,9 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
                 "measures": dict(s.measures),
                 "gates": [v.model_dump() | {"standing": _standing(v, s), "text": describe(v)} for v in s.verdicts],
                 "live": [
-                    {"viewpoint": live_view.KIND.read_answer(job.result).viewpoint, **job.measures}
+                    {"viewpoint": LIVE_VIEW.read_answer(job.result).viewpoint, **job.measures}
                     for job in s.jobs.values()
-                    if job.kind == live_view.KIND.name and job.status == "finished"
+                    if job.kind == LIVE_VIEW.name and job.status == "finished"
                 ],
             }
             for name, s in state.steps.items()
@@ -150,9 +150,9 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
     }
 
 
-def next_best_views(state: RunState) -> tuple[live_summary.Suggestion, ...]:
+def next_best_views(state: RunState) -> tuple[Suggestion, ...]:
     """Return the suggested views in a run's newest summary of its images; empty before the first one."""
     jobs = [job for step in state.steps.values() for job in step.jobs.values()]
-    done = [job for job in jobs if job.kind == live_summary.KIND.name and job.status == "finished"]
+    done = [job for job in jobs if job.kind == LIVE_SUMMARY.name and job.status == "finished"]
     newest = max(done, key=lambda job: job.enqueued_seq, default=None)
-    return () if newest is None else live_summary.KIND.read_answer(newest.result).next_best_views
+    return () if newest is None else LIVE_SUMMARY.read_answer(newest.result).next_best_views

@@ -1,8 +1,9 @@
-"""The computations: each kind of job has a folder, declared in its `__init__.py` and computed in its `compute.py`.
+"""The computations: each folder declares kinds of jobs in its `__init__.py` and computes them in its `compute.py`.
 
 `fuse/__init__.py` holds what steps, pages and audit read of the kind `fuse`: its arguments, its answer and its
-`KIND`; it loads no numerics. `fuse/compute.py` holds the function that a worker or a replay calls. The modules beside
-the folders are what several kinds share: `kind.py` and `records.py` for declarations, the others for computations.
+`KIND`; it loads no numerics. `fuse/compute.py` holds the function that a worker or a replay calls. Kinds of one
+subject share a folder: `image_poses` declares `features`, `match` and two more in its `KINDS`. The modules beside the
+folders are what several kinds share: `kind.py` and `records.py` for declarations, the others for computations.
 """
 
 from __future__ import annotations
@@ -15,6 +16,15 @@ from service.computations.kind import JobKind
 from service.core.loading import KindsOnDemand
 
 GROUP = "orthocapture.jobs"  # entry points of plug-ins; each names a JobKind
+SHARED_FOLDERS: Mapping[str, tuple[str, ...]] = {
+    "calibration": ("board_view", "calibrate"),
+    "scans": ("ct_surface", "locate_spheres", "merge_scans"),
+    "image_poses": ("features", "match", "structure_from_motion", "hybrid"),
+    "hand_held": ("hand_view", "hand_board"),
+    "live": ("coverage_points", "live_view", "live_summary"),
+    "further_cameras": ("develop", "further_camera", "further_view"),
+    "registration": ("detect_spheres", "register"),
+}  # the kinds of each folder that declares several; any other kind has the folder of its name
 
 
 @cache
@@ -25,7 +35,9 @@ def job_kinds() -> Mapping[str, JobKind[Any, Any]]:
         ConfigurationError: two declare the same name, or an entry point names something that is not a JobKind; also
             when they are listed.
     """
-    return KindsOnDemand[JobKind[Any, Any]](__name__, GROUP, JobKind, lambda kind: (kind.order, kind.name))
+    return KindsOnDemand[JobKind[Any, Any]](
+        __name__, GROUP, JobKind, lambda kind: (kind.order, kind.name), SHARED_FOLDERS
+    )
 
 
 # Labels of names that are not job kinds; each job kind declares its own label.

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from service.computations import calibration as calibration_records
 from service.computations import records as shared
-from service.computations.calibrate import records as calibration_records
 from service.computations.records import (
     Camera,
     ImagesCamera,

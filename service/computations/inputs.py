@@ -1,25 +1,38 @@
-"""What several jobs begin with: photographs as files, nominal cameras, and camera poses from those of the robot."""
+"""What several jobs begin with: photographs as files, nominal cameras, camera poses, and the scene of a capture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.computations.conversion import camera_reduced, camera_used, corrected_mounting
+from service.computations.conversion import camera_of, camera_reduced, camera_used, corrected_mounting
+from service.computations.hand_held import HeldArguments
 from service.computations.job import JobContext
 from service.computations.kind import JobRecord
-from service.computations.records import ArmCorrection, ImageFile, ImagesCamera, Mounting, PosedPhotograph
+from service.computations.live import LiveArguments
+from service.computations.records import (
+    ArmCorrection,
+    Hash,
+    ImageFile,
+    ImagesCamera,
+    Limits,
+    Mounting,
+    PosedPhotograph,
+)
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
 from service.compute.images.resample import resample
+from service.compute.markers.records import SphereOutline, outline_from_record
+from service.compute.planning.coverage import CoverageLimits, CoverageSurface, seen
 from service.core.errors import DataError
-from service.core.geometry import Array
+from service.core.geometry import Array, Transform
 from service.machine.executors import mapping
 from service.machine.resources import IMAGE_MB, processes_for
 
@@ -109,3 +122,81 @@ def _correct(
     if mine.any():
         joints = np.array([image.joints_rad for image, own in zip(images, mine, strict=True) if own])
         poses[mine] = corrected_mounting(correction).T_base_camera(joints, flange[mine])
+
+
+def read_outlines(
+    read: Callable[[Hash], Any], outlines: Hash, images: Sequence[PosedPhotograph], camera: CameraModel
+) -> list[list[SphereOutline]]:
+    """Return the outlines in each image, from the file of `detect_spheres`; `read` gives the content of a file."""
+    found = read(outlines)
+    return [[outline_from_record(record, camera) for record in found[image.viewpoint]] for image in images]
+
+
+_L = TypeVar("_L", bound=LiveArguments)
+_Capture = TypeVar("_Capture", bound=LiveArguments | HeldArguments)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureScene:
+    """The camera, spheres and surface by which the images of a capture are judged.
+
+    Attributes:
+        camera: the calibrated camera or, for images of the board, the nominal one.
+        spheres_m: (S, 3) centres, frame of the scene.
+        radius_m: the spheres' radius.
+        limits: the conditions on which a view counts for a point of the surface.
+        surface: the specimen's surface; None without a CT, and until it is computed.
+    """
+
+    camera: CameraModel
+    spheres_m: Array
+    radius_m: float
+    limits: CoverageLimits
+    surface: CoverageSurface | None
+
+    @property
+    def n_points(self) -> int:
+        """Number of points of the surface."""
+        return 0 if self.surface is None else len(self.surface.points_m)
+
+    def seen_from(self, T_scene_camera: Transform | None) -> NDArray[np.bool_]:
+        """Return the mask (P,) of the surface's points that a view shows; none where its pose is not known."""
+        if self.surface is None or T_scene_camera is None:
+            return np.zeros(self.n_points, dtype=bool)
+        return seen(self.surface, T_scene_camera[:3, 3], self.limits, T_scene_camera, self.camera)
+
+    def targets_m(self) -> Array:
+        """Return the points (T, 3) at which the registration's error is predicted: some 200, or the spheres."""
+        if self.surface is None:
+            return self.spheres_m
+        return self.surface.points_m[:: max(1, self.n_points // 200)]
+
+
+def live_scene(context: JobContext[_L]) -> CaptureScene:
+    """Return the scene of a job on the images of a capture by the robot."""
+    arguments = context.arguments
+    return CaptureScene(
+        camera_of(arguments.camera),
+        np.array(arguments.spheres_m),
+        arguments.radius_m,
+        limits_of(arguments.limits),
+        kept_surface(context),
+    )
+
+
+def kept_surface(context: JobContext[_Capture]) -> CoverageSurface | None:
+    """Return the specimen's surface from the file of the job `coverage_points`; None without such a file."""
+    sha256 = context.arguments.surface
+    return None if sha256 is None else _surface_in(context.input(sha256))
+
+
+@lru_cache(maxsize=1)
+def _surface_in(artefact: Path) -> CoverageSurface:
+    """Return the surface in an artefact, whose file never changes, with its tree of rays, slow to build."""
+    with np.load(artefact, allow_pickle=False) as arrays:
+        return CoverageSurface(**{name: arrays[name] for name in arrays.files})
+
+
+def limits_of(record: Limits) -> CoverageLimits:
+    """Return the limits of a job's record."""
+    return CoverageLimits(record.max_angle_deg, record.max_distance_m, record.min_views)

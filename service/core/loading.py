@@ -16,6 +16,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, distributions
+from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
 from service.core.errors import ConfigurationError
@@ -56,6 +57,7 @@ class DeclaredKind(Protocol):
 
 
 K = TypeVar("K", bound=DeclaredKind)
+_NONE_SHARED: Mapping[str, tuple[str, ...]] = {}
 
 
 def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
@@ -71,8 +73,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
         ConfigurationError: two declare the same name, or an entry point names something else.
     """
     modules = [importlib.import_module(name) for name in _modules(package)]
-    declared: list[object] = [module.KIND for module in modules if hasattr(module, "KIND")]
-    declared += [kind for module in modules for kind in getattr(module, "KINDS", ())]
+    declared = [kind for module in modules for kind in _declared_in(module)]
     declared += [point.load() for point in plug_ins(group)]
     kinds: dict[str, K] = {}
     for one in declared:
@@ -106,7 +107,7 @@ def _packages_in(place: str) -> tuple[tuple[str, tuple[EntryPoint, ...]], ...]:
 
 
 def _modules(package: str) -> list[str]:
-    """Return the modules that declare kinds; a folder declares one in its `__init__.py`, and computes it beside."""
+    """Return the modules that declare kinds; a folder declares them in its `__init__.py`."""
     path = getattr(importlib.import_module(package), "__path__", None)
     if path is None:
         return [package]
@@ -115,26 +116,52 @@ def _modules(package: str) -> list[str]:
     return folders or [found.name for found in inside]
 
 
+def _declared_in(module: ModuleType) -> list[object]:
+    """Return what a module declares as KIND or in KINDS."""
+    alone: list[object] = [module.KIND] if hasattr(module, "KIND") else []
+    return [*alone, *getattr(module, "KINDS", ())]
+
+
 class KindsOnDemand(Mapping[str, K]):
     """The kinds that `declared_kinds` finds, each imported when it is asked for: most programs need a few.
 
-    So the module of a kind has its name. All are imported when they are listed or counted, when an unknown name is
-    asked for, and at once where there are plug-ins: these may not use a name twice.
+    So the module of a kind has its name, or is said to declare it beside others. All are imported when they are
+    listed or counted, when an unknown name is asked for, and at once where there are plug-ins: these may not use a
+    name twice.
     """
 
-    def __init__(self, package: str, group: str, kind: type[K], order: Callable[[K], Any]) -> None:
-        """Take the arguments of `declared_kinds`, and `order`, which sorts kinds. Raises ConfigurationError."""
+    def __init__(
+        self,
+        package: str,
+        group: str,
+        kind: type[K],
+        order: Callable[[K], Any],
+        shared: Mapping[str, tuple[str, ...]] = _NONE_SHARED,
+    ) -> None:
+        """Note where kinds are declared.
+
+        Args:
+            package: the name of a package, as for `declared_kinds`.
+            group: the group of entry points.
+            kind: the type of what is declared.
+            order: sorts kinds.
+            shared: the names of the kinds that a module of the package declares together, in its KINDS.
+
+        Raises:
+            ConfigurationError: plug-ins are installed, and `declared_kinds` refuses one.
+        """
         self._package, self._group, self._kind, self._order = package, group, kind, order
         self._modules = {name.rpartition(".")[2]: name for name in _modules(package)}
+        self._modules |= {name: f"{package}.{module}" for module, names in shared.items() for name in names}
         self._all: dict[str, K] | None = None
         if plug_ins(group):
             self._whole()
 
     def __getitem__(self, name: str) -> K:
         if self._all is None and name in self._modules:
-            found: object = getattr(importlib.import_module(self._modules[name]), "KIND", None)
-            if isinstance(found, self._kind) and found.name == name:
-                return found
+            for found in _declared_in(importlib.import_module(self._modules[name])):
+                if isinstance(found, self._kind) and found.name == name:
+                    return found
         return self._whole()[name]
 
     def __iter__(self) -> Iterator[str]:

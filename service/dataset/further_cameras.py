@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.computations.further_camera import Answer
+from service.computations.further_cameras import FurtherCameraAnswer
 from service.computations.records import Matrix
 from service.compute.camera_model import CameraModel
 from service.compute.images.views import Splits
@@ -44,7 +44,7 @@ class KnownFurtherCamera:
     optics: RecordedOptics
     calibration: ArtefactRef
     images: dict[str, ArtefactRef]
-    located: Answer | None
+    located: FurtherCameraAnswer | None
     clock: ClockOffset | None
 
     @property
@@ -69,13 +69,13 @@ class KnownFurtherCamera:
         return pose_sigmas(self.located)
 
 
-def pose_sigmas(located: Answer) -> tuple[float, float]:
+def pose_sigmas(located: FurtherCameraAnswer) -> tuple[float, float]:
     """Return the standard deviations of a located camera's position (m) and rotation (rad): roots of the traces."""
     variances = np.diag(np.array(located.covariance))
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
 
 
-def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | None:
+def further_pose(located: FurtherCameraAnswer, T_scan_first: Matrix | None) -> Transform | None:
     """Return T_scan_camera (4, 4) of a further camera while the first one was at this pose; None if not known."""
     if located.T_outer_camera is None or (located.mounted == "rigid" and T_scan_first is None):
         return None
@@ -237,7 +237,11 @@ def further_views(summary: RunSummary, T_scan_first: Mapping[str, Transform]) ->
 
 
 def _view(
-    summary: RunSummary, capture: ViewpointCaptured, number: int, located: Answer, T_scan_first: Transform
+    summary: RunSummary,
+    capture: ViewpointCaptured,
+    number: int,
+    located: FurtherCameraAnswer,
+    T_scan_first: Transform,
 ) -> FurtherView:
     exposure = capture.further[number]
     photograph, T_outer_camera = exposure.artefacts[0], np.array(located.T_outer_camera)
@@ -258,7 +262,7 @@ def _view(
     )
 
 
-def _stated(captures: Sequence[ViewpointCaptured], located: Answer) -> dict[str, Any]:
+def _stated(captures: Sequence[ViewpointCaptured], located: FurtherCameraAnswer) -> dict[str, Any]:
     """Return the entry of `dataset.json` for one further camera."""
     clock = clock_offset(captures, located.device)
     said: dict[str, Any] = {

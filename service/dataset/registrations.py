@@ -14,10 +14,12 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from service.computations import evaluate, further_camera, register, structure_from_motion
+from service.computations import evaluate
 from service.computations.evaluate import ErrorBudget, Row, best_row
+from service.computations.further_cameras import FurtherCameraAnswer
+from service.computations.image_poses import STRUCTURE_FROM_MOTION
 from service.computations.kind import JobRecord
-from service.computations.register import Registration, Registrations
+from service.computations.registration import REGISTER, Registration, Registrations
 from service.core.errors import IntegrityError
 from service.core.gates import late_words
 from service.core.protocol import Protocol
@@ -59,13 +61,13 @@ def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration
     """Return every registration record by its name: those in the step's result, then those that arrived later."""
     result = last_result(protocol, state, "registrations", Registrations)
     found = {} if result is None else dict(result.registrations)
-    for _, job in _finished(protocol, state, "registrations", register.KIND.name) if found else ():
-        answer = register.KIND.read_answer(job.result)
+    for _, job in _finished(protocol, state, "registrations", REGISTER.name) if found else ():
+        answer = REGISTER.read_answer(job.result)
         found.setdefault(registration_name(answer), answer)
     return found
 
 
-def further_cameras(protocol: Protocol, state: RunState) -> dict[str, further_camera.Answer]:
+def further_cameras(protocol: Protocol, state: RunState) -> dict[str, FurtherCameraAnswer]:
     """Return the further cameras of the rig by their names, as the registration step located them."""
     result = last_result(protocol, state, "registrations", Registrations)
     return {} if result is None else dict(result.cameras)
@@ -95,7 +97,7 @@ def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
     model is one bundle adjustment of all tracks from there (service/compute/sfm/child.py).
     """
     if not any(
-        job.kind == structure_from_motion.KIND.name
+        job.kind == STRUCTURE_FROM_MOTION.name
         and "features" in job.arguments  # absent in older runs, which shared nothing
         for step in state.steps.values()
         for job in step.jobs.values()

@@ -16,7 +16,7 @@ import numpy as np
 from drivers.meshes.companions import companion_names
 from drivers.meshes.foreign_text import alike
 from service.computations.records import SpheresFound
-from service.computations.register import ARM, Registration
+from service.computations.registration import ARM, Registration
 from service.compute.camera_model import CameraModel
 from service.compute.images.render import Cylinder, RayMesh, WorldSphere, hull_mask, posts_below
 from service.compute.images.views import splits

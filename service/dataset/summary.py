@@ -14,7 +14,7 @@ import numpy as np
 from service.computations import fuse
 from service.computations.evaluate import ErrorBudget, Row
 from service.computations.records import Point, SpheresFound
-from service.computations.register import Registration
+from service.computations.registration import Registration
 from service.compute.surfaces.surface import read_ply
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, apply

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import ValidationError
 
-from service.computations import hybrid, register
-from service.computations.register import Registration
+from service.computations.image_poses import HYBRID, HybridModel
+from service.computations.registration import POSE_ERRORS, REGISTER, Registration
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, skew
 from service.core.jobs import jobs_of
@@ -54,7 +54,7 @@ def stated_pose_errors(summary: RunSummary, registered: Registration, names: Seq
         names: viewpoints, in the order of the rows.
     """
     made = _job(summary, registered)
-    kept = [ref for ref in made.artefacts if ref.kind == register.POSE_ERRORS] if made is not None else []
+    kept = [ref for ref in made.artefacts if ref.kind == POSE_ERRORS] if made is not None else []
     return _joint(summary, kept[0].sha256, "covariance", names) if kept else None
 
 
@@ -76,8 +76,8 @@ def _tracks(summary: RunSummary, registered: Registration) -> str | None:
 def _job(summary: RunSummary, registered: Registration) -> JobState | None:
     """Return the job that computed a registration."""
     finished = (job for job in jobs_of(summary.state).values() if job.status == "finished")
-    made = (job for job in finished if job.kind == register.KIND.name)
-    return next((job for job in made if register.KIND.read_answer(job.result) == registered), None)
+    made = (job for job in finished if job.kind == REGISTER.name)
+    return next((job for job in made if REGISTER.read_answer(job.result) == registered), None)
 
 
 _FILE = "hybrid_poses"  # kind of the artefact that holds a HybridModel
@@ -134,7 +134,7 @@ def view_covariances(
     Raises:
         IntegrityError: the recorded file of the hybrid poses is not one.
     """
-    stated = _of_hybrid(summary) if own == hybrid.KIND.name else {}
+    stated = _of_hybrid(summary) if own == HYBRID.name else {}
     if set(names) <= set(stated):
         return ViewCovariances(stated, _WHOLE, None)
     whole = stated_pose_errors(summary, registered, names)
@@ -182,10 +182,10 @@ def _of_hybrid(summary: RunSummary) -> dict[str, Array]:
     for job in sorted(jobs, key=lambda job: job.ended_seq, reverse=True):
         reduced = any(job.arguments.get(key) is not None for key in ("reduced_to", "full_camera"))
         ref = next((one for one in job.artefacts if one.kind == _FILE), None)
-        if job.kind != hybrid.KIND.name or reduced or ref is None:
+        if job.kind != HYBRID.name or reduced or ref is None:
             continue
         try:
-            model = hybrid.HybridModel.model_validate_json(summary.store.artefact_path(ref.sha256).read_bytes())
+            model = HybridModel.model_validate_json(summary.store.artefact_path(ref.sha256).read_bytes())
         except ValidationError as error:
             raise IntegrityError("the recorded hybrid poses cannot be read", where=ref.original_name) from error
         if model.pose_covariance_frame == "scan":

@@ -8,7 +8,7 @@ from typing import TypedDict
 
 import numpy as np
 
-from service.computations import board_view
+from service.computations.calibration import BOARD_VIEW, BoardViewAnswer, BoardViewArguments, Corners
 from service.computations.records import Camera, ImageFile, image_of
 from service.compute.calibration.board import Board, BoardView
 from service.compute.calibration.board_design import CalibrationTargets, ChosenViews, PlanPrediction
@@ -77,10 +77,10 @@ class BoardLooks:
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
             if sha256 not in begun:
-                arguments = board_view.Arguments(
+                arguments = BoardViewArguments(
                     image=ImageFile(viewpoint=capture.viewpoint, sha256=sha256), **board_arguments(self.board)
                 )
-                self.context.evidence.enqueue(JobRequest.of(board_view.KIND, arguments), sha256)
+                self.context.evidence.enqueue(JobRequest.of(BOARD_VIEW, arguments), sha256)
 
     def wait(self) -> None:
         """Wait until every image has been searched."""
@@ -133,7 +133,7 @@ class BoardLooks:
             stop_for_lens(self.context, row)
 
     def _jobs(self, step: str) -> list[JobState]:
-        return [job for job in self.context.evidence.jobs(step) if job.kind == board_view.KIND.name]
+        return [job for job in self.context.evidence.jobs(step) if job.kind == BOARD_VIEW.name]
 
     def _by_image(self, step: str) -> dict[str, JobState]:
         return {image_of(j).sha256: j for j in self._jobs(step) if j.status != "enqueued"}
@@ -158,7 +158,7 @@ class BoardLooks:
         if not answer.seen:
             return SearchedBoardImage(capture, False, answer.reason)
         ref = job.artefacts[0]
-        found = board_view.Corners.model_validate_json(self.context.evidence.path(ref).read_bytes())
+        found = Corners.model_validate_json(self.context.evidence.path(ref).read_bytes())
         view = BoardView(np.array(found.indices, dtype=np.int64), np.array(found.corners, dtype=np.float64))
         return SearchedBoardImage(capture, True, "", ref.sha256, view, found.size)
 
@@ -169,8 +169,8 @@ class BoardLooks:
             self.context.tell(f"{look.capture.viewpoint}: not used, {look.reason}")
 
 
-def _answer_of(job: JobState) -> board_view.Answer:
-    return board_view.KIND.read_answer(job.result)
+def _answer_of(job: JobState) -> BoardViewAnswer:
+    return BOARD_VIEW.read_answer(job.result)
 
 
 class BoardFields(TypedDict):

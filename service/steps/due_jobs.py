@@ -9,19 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from service.computations import (
-    calibrate,
-    detect_spheres,
-    evaluate,
-    features,
-    hybrid,
-    match,
-    register,
-    structure_from_motion,
+from service.computations import evaluate
+from service.computations.calibration import CALIBRATE, CalibrateAnswer
+from service.computations.image_poses import (
+    FEATURES,
+    HYBRID,
+    MATCH,
+    STRUCTURE_FROM_MOTION,
+    FeaturesArguments,
+    ImagesToMatch,
+    PairsToMatch,
+    SfmEffort,
 )
-from service.computations.features import SfmEffort
 from service.computations.kind import JobRecord, read_part
 from service.computations.records import Camera, ImageFile
+from service.computations.registration import DETECT_SPHERES, REGISTER
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
@@ -50,7 +52,7 @@ class EarlyFeatures:
     """
 
     context: StepContext
-    camera: EarlierAnswer[calibrate.Answer]
+    camera: EarlierAnswer[CalibrateAnswer]
     effort: SfmEffort
     neighbours: Mapping[str, Sequence[str]]  # by viewpoint, as planned
     asked: set[str] = field(default_factory=set[str])
@@ -63,7 +65,7 @@ class EarlyFeatures:
             return None
         wanted = registration.params_as(RegistrationParams)
         try:
-            camera = context.earlier_answer(wanted.calibration, calibrate.KIND)
+            camera = context.earlier_answer(wanted.calibration, CALIBRATE)
         except ConfigurationError:
             return None
         effort = wanted.structure_from_motion.effort
@@ -88,14 +90,14 @@ class EarlyFeatures:
             if sha256 in self.asked or not all(capture.verdicts.values()):
                 continue
             self.asked.add(sha256)
-            arguments = features.Arguments(
+            arguments = FeaturesArguments(
                 camera=self.camera.answer.camera,
                 effort=self.effort,
                 images=(ImageFile(viewpoint=capture.viewpoint, sha256=sha256),),
                 match_with=tuple(sorted(self.neighbours.get(capture.viewpoint, ()))),
             )
             references = {"camera": self.camera.reference("camera")}
-            self.context.evidence.enqueue(JobRequest.of(features.KIND, arguments, references, EARLY), sha256)
+            self.context.evidence.enqueue(JobRequest.of(FEATURES, arguments, references, EARLY), sha256)
 
 
 def _registration_of(protocol: Protocol, capture: str) -> Step | None:
@@ -127,7 +129,7 @@ def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
             if job.kind == "features" and job.priority == EARLY and job.status == "finished":
                 found[_image_of(job).viewpoint] = (step.id, job)
             elif job.kind == "match" and job.priority == EARLY:
-                pairs_done |= set(read_part(match.PairsToMatch, job.arguments).pairs)
+                pairs_done |= set(read_part(PairsToMatch, job.arguments).pairs)
                 matched.add(job.idempotency_key.split("/")[3])
     jobs: list[NewJob] = []
     for name, (step_id, job) in found.items():
@@ -144,14 +146,12 @@ def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
         arguments = {**shared, "features": named, "pairs": [list(pair) for pair in pairs]}
         key = job_key(state, step_id, "match", sha256)
         attempt = state.steps[step_id].attempt
-        jobs.append(
-            NewJob(match.KIND.name, step_id, attempt, key, arguments, priority=EARLY, version=match.KIND.version)
-        )
+        jobs.append(NewJob(MATCH.name, step_id, attempt, key, arguments, priority=EARLY, version=MATCH.version))
     return jobs
 
 
-def _asked_of(job: JobState) -> features.ImagesToMatch:
-    return read_part(features.ImagesToMatch, job.arguments)
+def _asked_of(job: JobState) -> ImagesToMatch:
+    return read_part(ImagesToMatch, job.arguments)
 
 
 def _image_of(job: JobState) -> ImageFile:
@@ -237,17 +237,17 @@ _NAMES = {
     "hybrid": "images, robot and spheres together",
 }
 _GUESS_S = {  # per image
-    detect_spheres.KIND.name: 0.3,
-    register.KIND.name: 0.15,
-    features.KIND.name: 1.5,
-    match.KIND.name: 0.4,
-    structure_from_motion.KIND.name: 1.5,
-    hybrid.KIND.name: 0.5,
+    DETECT_SPHERES.name: 0.3,
+    REGISTER.name: 0.15,
+    FEATURES.name: 1.5,
+    MATCH.name: 0.4,
+    STRUCTURE_FROM_MOTION.name: 1.5,
+    HYBRID.name: 0.5,
     evaluate.KIND.name: 0.1,
 }
-_BY_PIXELS = frozenset({detect_spheres.KIND.name, features.KIND.name})
+_BY_PIXELS = frozenset({DETECT_SPHERES.name, FEATURES.name})
 _PIXELS = 1920 * 1280
-_SEVERAL_CORES = frozenset({detect_spheres.KIND.name})
+_SEVERAL_CORES = frozenset({DETECT_SPHERES.name})
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +309,7 @@ class _Work(JobRecord):
 
     def count(self, kind: str) -> int:
         """Return the number of images, or of pairs."""
-        return len(self.pairs if kind == match.KIND.name else self.images)
+        return len(self.pairs if kind == MATCH.name else self.images)
 
     def size(self, kind: str) -> float:
         """Return the number, weighted by their pixels for jobs whose duration depends on them."""
@@ -415,16 +415,16 @@ def _left_of(
     return left
 
 
-_MODELLED = (features.KIND.name, match.KIND.name, structure_from_motion.KIND.name)
+_MODELLED = (FEATURES.name, MATCH.name, STRUCTURE_FROM_MOTION.name)
 _CHAINS = {
     "triangulated": _MODELLED,
     "colmap": _MODELLED,
     "glomap": _MODELLED,
-    "hybrid": (*_MODELLED, hybrid.KIND.name),
+    "hybrid": (*_MODELLED, HYBRID.name),
 }
 
 
 def _rest(source: str, last: str) -> tuple[str, ...]:
     """Return the kinds of jobs that follow the last one that is planned."""
-    chain = (detect_spheres.KIND.name, *_CHAINS.get(source, ()), register.KIND.name)
+    chain = (DETECT_SPHERES.name, *_CHAINS.get(source, ()), REGISTER.name)
     return chain[chain.index(last) + 1 :] if last in chain else ()

@@ -9,7 +9,19 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from service.computations import calibrate, coverage_points, hand_board, hand_view, layout
+from service.computations import layout
+from service.computations.calibration import CALIBRATE
+from service.computations.hand_held import (
+    HAND_BOARD,
+    HAND_VIEW,
+    BoardArguments,
+    HandBoardArguments,
+    HandViewAnswer,
+    HandViewArguments,
+    PlannedPlace,
+    SpecimenArguments,
+)
+from service.computations.live import COVERAGE_POINTS, CoveragePointsArguments
 from service.computations.records import Limits, Point, image_of
 from service.core.errors import ConfigurationError
 from service.core.gates import evaluate_gates
@@ -109,7 +121,7 @@ class Result(Record):
 class CommonArguments:
     """The arguments that all jobs of the step share, and the references that are recorded in their place."""
 
-    values: hand_board.BoardArguments | hand_view.SpecimenArguments
+    values: BoardArguments | SpecimenArguments
     references: Mapping[str, Reference | None]
 
 
@@ -122,10 +134,10 @@ def common_arguments(context: StepContext, params: Params) -> CommonArguments:
     return _of_board(context, params) if params.purpose == "calibration" else _of_specimen(context, params)
 
 
-def _places(params: Params) -> tuple[hand_view.PlannedPlace, ...]:
+def _places(params: Params) -> tuple[PlannedPlace, ...]:
     """Return the places of the hemisphere."""
     return tuple(
-        hand_view.PlannedPlace(
+        PlannedPlace(
             name=f"{ring.tilt_deg:02.0f}/{k + 1}",
             tilt_deg=ring.tilt_deg,
             azimuth_deg=azimuth,
@@ -158,7 +170,7 @@ def _of_board(context: StepContext, params: Params) -> CommonArguments:
             where=f"step {context.step.id}",
             remedy="Add a section `board`",
         )
-    values = hand_board.BoardArguments(
+    values = BoardArguments(
         places=_places(params),
         within_deg=9.0,
         first_words=_first_words(params, "calibration board"),
@@ -179,9 +191,9 @@ def _of_specimen(context: StepContext, params: Params) -> CommonArguments:
             remedy="Name the calibration step in `calibration`",
         )
     error, covers = (next((g for g in context.step.gates if g.measure == m), None) for m in (ERROR, COVERAGE))
-    calibration = context.earlier_answer(params.calibration, calibrate.KIND)
+    calibration = context.earlier_answer(params.calibration, CALIBRATE)
     spheres, rough, spheres_from = _spheres(context, params)
-    values = hand_view.SpecimenArguments(
+    values = SpecimenArguments(
         places=_places(params),
         within_deg=14.0,
         first_words=_first_words(params, "specimen"),
@@ -228,7 +240,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
 def failure_words(job: JobState) -> str:
     """Explain a failed job on the images: what it means, and what to do."""
     why = job.message.rstrip(".")
-    if job.kind == coverage_points.KIND.name:
+    if job.kind == COVERAGE_POINTS.name:
         return (
             f"the coverage of the specimen cannot be computed: {why}. Images are judged without it. A gate on the "
             "coverage cannot pass: finish with the images so far, and the step offers what can be done"
@@ -251,17 +263,17 @@ class Guide:
     @property
     def kind(self) -> str:
         """The kind of the jobs."""
-        return (hand_board if self.params.purpose == "calibration" else hand_view).KIND.name
+        return (HAND_BOARD if self.params.purpose == "calibration" else HAND_VIEW).name
 
     def begin(self) -> None:
         """Enqueue the specimen's surface if there is a CT, and say where to begin."""
         mesh, shared = self._mesh(), self.shared.values
-        if mesh is not None and isinstance(shared, hand_view.SpecimenArguments):  # a board has no surface
-            arguments = coverage_points.Arguments(
+        if mesh is not None and isinstance(shared, SpecimenArguments):  # a board has no surface
+            arguments = CoveragePointsArguments(
                 mesh=mesh, spheres_m=shared.spheres_m, radius_m=shared.radius_m, limits=shared.limits
             )
             references = {"spheres_m": self.shared.references["spheres_m"]}
-            request = JobRequest.of(coverage_points.KIND, arguments, references)
+            request = JobRequest.of(COVERAGE_POINTS, arguments, references)
             self.context.evidence.enqueue(request, "specimen")
         done = self._answers()
         self._say(_answer_of(done[-1]).words if done else self.shared.values.first_words)
@@ -280,7 +292,7 @@ class Guide:
                 self._reported.add(job.job)
                 self._report(job)
         for job in self.context.evidence.jobs(self.context.step.id):
-            if job.kind == coverage_points.KIND.name and job.status == "failed" and job.job not in self._reported:
+            if job.kind == COVERAGE_POINTS.name and job.status == "failed" and job.job not in self._reported:
                 self._reported.add(job.job)
                 self.context.tell(failure_words(job))
 
@@ -358,7 +370,7 @@ class Guide:
 
     def _surface(self) -> str | None:
         jobs = self.context.evidence.jobs(self.context.step.id)
-        done = [job for job in jobs if job.kind == coverage_points.KIND.name and job.status == "finished"]
+        done = [job for job in jobs if job.kind == COVERAGE_POINTS.name and job.status == "finished"]
         return done[-1].artefacts[0].sha256 if done else None
 
     def _enqueue(self, view: ViewHeld) -> None:
@@ -386,9 +398,9 @@ class Guide:
         arguments = {**shared.set_fields(), "image": image, "earlier": earlier, "surface": self._surface()}
         references = {**self.shared.references, "earlier": looks}
         request = (
-            JobRequest.of(hand_board.KIND, hand_board.Arguments.model_validate(arguments), references)
+            JobRequest.of(HAND_BOARD, HandBoardArguments.model_validate(arguments), references)
             if self.params.purpose == "calibration"
-            else JobRequest.of(hand_view.KIND, hand_view.Arguments.model_validate(arguments), references)
+            else JobRequest.of(HAND_VIEW, HandViewArguments.model_validate(arguments), references)
         )
         self.context.evidence.enqueue(request, view.artefacts[0].sha256)
 
@@ -430,6 +442,6 @@ def _settings(stated: RecordedOptics) -> str:
     return f"{aperture}, {time}, {'an unknown ISO' if stated.iso is None else f'ISO {stated.iso:g}'}"
 
 
-def _answer_of(job: JobState) -> hand_view.Answer:
+def _answer_of(job: JobState) -> HandViewAnswer:
     """Return the answer of either kind of job: both answer alike."""
-    return hand_view.KIND.read_answer(job.result)
+    return HAND_VIEW.read_answer(job.result)

@@ -9,8 +9,21 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from service.computations import calibrate, coverage_points, further_view, live_summary, live_view, locate_spheres
+from service.computations.calibration import CALIBRATE
+from service.computations.further_cameras import FURTHER_VIEW, FurtherViewArguments
+from service.computations.live import (
+    COVERAGE_POINTS,
+    LIVE_SUMMARY,
+    LIVE_VIEW,
+    CandidateView,
+    CoveragePointsArguments,
+    LiveArguments,
+    LiveSummaryArguments,
+    LiveViewArguments,
+    Suggestion,
+)
 from service.computations.records import Hash, ImageFile, Limits, Mounting, Point, PosedPhotograph, image_of
+from service.computations.scans import LOCATE_SPHERES
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.gates import limits as gate_text
 from service.core.jobs import Each, Reference, jobs_of, key_stem, resolve
@@ -43,19 +56,19 @@ def look_at_further(
         references: the references that are recorded instead of `spheres_m`.
     """
     jobs = context.evidence.jobs(context.step.id)
-    begun = {image_of(job).sha256 for job in jobs if job.kind == further_view.KIND.name}
+    begun = {image_of(job).sha256 for job in jobs if job.kind == FURTHER_VIEW.name}
     for viewpoint, exposure in _exposures(context):
         sha256 = exposure.artefacts[0].sha256
         if sha256 in begun:
             continue
-        arguments = further_view.Arguments(
+        arguments = FurtherViewArguments(
             device=exposure.device,
             image=ImageFile(viewpoint=viewpoint, sha256=sha256),
             calibration=exposure.calibration.sha256,
             spheres_m=tuple(spheres_m),
             radius_m=radius_m,
         )
-        request = JobRequest.of(further_view.KIND, arguments, {"spheres_m": references["spheres_m"]}, LIVE)
+        request = JobRequest.of(FURTHER_VIEW, arguments, {"spheres_m": references["spheres_m"]}, LIVE)
         context.evidence.enqueue(request, sha256)
 
 
@@ -74,7 +87,7 @@ def describe_further(job: JobState) -> str:
     viewpoint = image_of(job).viewpoint
     if job.status == "failed":
         return f"{viewpoint}, further camera: could not be analysed: {job.message}"
-    m, answer = job.measures, further_view.KIND.read_answer(job.result)
+    m, answer = job.measures, FURTHER_VIEW.read_answer(job.result)
     if answer.reason:
         return f"{viewpoint}, {answer.device}: this image does not locate it: {answer.reason}"
     return (
@@ -136,11 +149,11 @@ class LiveAnalysis:
         analysis = cls(context, params, shared)
         if not any(job.kind == "coverage_points" for job in analysis._jobs("coverage_points")):
             live = shared.values
-            arguments = coverage_points.Arguments(
+            arguments = CoveragePointsArguments(
                 mesh=mesh, spheres_m=live.spheres_m, radius_m=live.radius_m, limits=live.limits
             )
             references = {"spheres_m": shared.taken["spheres_m"]}
-            request = JobRequest.of(coverage_points.KIND, arguments, references, LIVE)
+            request = JobRequest.of(COVERAGE_POINTS, arguments, references, LIVE)
             context.evidence.enqueue(request, "specimen")
         analysis.told = {job.job for kind in _DESCRIBED for job in analysis._jobs(kind) if job.status != "enqueued"}
         return analysis
@@ -155,7 +168,7 @@ class LiveAnalysis:
             image = PosedPhotograph(viewpoint=capture.viewpoint, station=capture.station, sha256=sha256)
             mounting, mounted_by = mounting_of(self.context, [self.params.hand_eye], [capture.station])
             earlier, looks = self._earlier()
-            arguments = live_view.Arguments(
+            arguments = LiveViewArguments(
                 **self.shared.values.set_fields(),
                 **mounting.set_fields(),
                 image=with_robot_pose(image, capture),
@@ -163,7 +176,7 @@ class LiveAnalysis:
                 earlier=earlier,
             )
             references = {**self.shared.taken, **mounted_by, "earlier": looks}
-            request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
+            request = JobRequest.of(LIVE_VIEW, arguments, references, LIVE)
             self.context.evidence.enqueue(request, sha256)
         look_at_further(self.context, self.shared.values.spheres_m, self.shared.values.radius_m, self.shared.taken)
         self._tell()
@@ -184,7 +197,7 @@ class LiveAnalysis:
         limit_mm = error_gate.max if error_gate and error_gate.max is not None else self.params.aim_mm
         least = coverage_gate.min if coverage_gate and coverage_gate.min is not None else 0.0
         views, looks = self._earlier()
-        arguments = live_summary.Arguments(
+        arguments = LiveSummaryArguments(
             **self.shared.values.set_fields(),
             **self.shared.mounting.set_fields(),
             surface=self._surface(),
@@ -193,17 +206,17 @@ class LiveAnalysis:
             limit_m=metres(limit_mm),
             min_coverage=least,
             candidates=tuple(
-                live_summary.CandidateView(name=v.name, T_base_camera=v.T_base_camera.tolist(), travel_s=travel_s)
+                CandidateView(name=v.name, T_base_camera=v.T_base_camera.tolist(), travel_s=travel_s)
                 for v, travel_s in candidates
             ),
         )
-        request = JobRequest.of(live_summary.KIND, arguments, {**self.shared.taken, "views": looks})
+        request = JobRequest.of(LIVE_SUMMARY, arguments, {**self.shared.taken, "views": looks})
         try:
             (answer,) = self.context.evidence.run_jobs(request)
         except ComputeError as error:
             self.context.note("no_live_numbers", why=str(error))
             return {}
-        found = live_summary.KIND.read_answer(answer.result)
+        found = LIVE_SUMMARY.read_answer(answer.result)
         for why in found.reasons.values():
             self.context.tell(why)
         failed = [gate for gate in self.context.step.gates if _fails(gate, answer.measures)]
@@ -248,7 +261,7 @@ class LiveAnalysis:
         self,
         failed: Sequence[Gate],
         measures: Mapping[str, float],
-        suggestions: Sequence[live_summary.Suggestion],
+        suggestions: Sequence[Suggestion],
         retakes: str,
         again: int,
     ) -> None:
@@ -308,9 +321,7 @@ class LiveAnalysis:
         hashes = [capture.artefacts[0].sha256 for capture in captures]
         width = self.shared.values.camera.width
         jobs = [by_image[sha256] for sha256 in hashes if sha256 in by_image]
-        return [
-            ImageSharpness.of(job, black=live_view.KIND.read_answer(job.result).black, width=width) for job in jobs
-        ]
+        return [ImageSharpness.of(job, black=LIVE_VIEW.read_answer(job.result).black, width=width) for job in jobs]
 
     def _surface(self) -> str | None:
         done = [job for job in self._jobs("coverage_points") if job.status == "finished"]
@@ -356,7 +367,7 @@ def describe_view(job: JobState) -> str:
     """Return one line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
     if job.status == "failed":
         return f"{image_of(job).viewpoint}: could not be analysed: {job.message}"
-    m, answer = job.measures, live_view.KIND.read_answer(job.result)
+    m, answer = job.measures, LIVE_VIEW.read_answer(job.result)
     parts = [seen_words(m["spheres_seen"], m.get("spheres_expected"))]
     if "outline_rms_px" in m:
         parts.append(f"{m['outline_rms_px']:.2f} px")
@@ -369,7 +380,7 @@ def describe_view(job: JobState) -> str:
     return f"{answer.viewpoint}: {', '.join(parts)}"
 
 
-_DESCRIBED = {live_view.KIND.name: describe_view, further_view.KIND.name: describe_further}
+_DESCRIBED = {LIVE_VIEW.name: describe_view, FURTHER_VIEW.name: describe_further}
 
 
 @dataclass(frozen=True, slots=True)
@@ -380,16 +391,16 @@ class SharedArguments:
     the arm's correction, if there is one, because the poses of the images are corrected too.
     """
 
-    values: live_view.LiveArguments  # without the mounting, which is another at other stations
+    values: LiveArguments  # without the mounting, which is another at other stations
     mounting: Mounting
     taken: Mapping[str, Reference | Each | None]
 
     @classmethod
     def of(cls, context: StepContext, params: LiveParams) -> SharedArguments:
         """Read the arguments from the results of earlier steps. Raises ConfigurationError if one is missing."""
-        scan = context.earlier_answer(params.spheres_of, locate_spheres.KIND)
-        calibration = context.earlier_answer(params.calibration, calibrate.KIND)
-        hand_eye = context.earlier_answer(params.hand_eye, calibrate.KIND)
+        scan = context.earlier_answer(params.spheres_of, LOCATE_SPHERES)
+        calibration = context.earlier_answer(params.calibration, CALIBRATE)
+        hand_eye = context.earlier_answer(params.hand_eye, CALIBRATE)
         record = hand_eye.answer.hand_eye
         if record is None:
             raise ConfigurationError(
@@ -401,7 +412,7 @@ class SharedArguments:
         sigma_m = metres(_rms(best.residuals.held_out_mm.values()))
         sigma_rad = float(np.radians(_rms(best.residuals.held_out_deg.values())))
         at = "hand_eye" if record.arm_correction is None else "hand_eye/arm_correction"
-        values = live_view.LiveArguments(
+        values = LiveArguments(
             camera=calibration.answer.camera,
             hand_eye_covariance=best.sigma.covariance,
             arm_sigma_m=sigma_m if params.arm_sigma_mm is None else metres(params.arm_sigma_mm),

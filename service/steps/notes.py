@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.computations.live_summary import Suggestion
+from service.computations.live import Suggestion
 from service.computations.records import Matrix
 from service.core.protocol import Step
 from service.core.recovery import planned_views

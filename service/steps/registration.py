@@ -12,10 +12,13 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, field_validator
 
-from service.computations import calibrate, detect_spheres, develop, hand_board, hand_view, locate_spheres
-from service.computations.features import SfmEffort
+from service.computations.calibration import CALIBRATE
+from service.computations.further_cameras import DEVELOP, DevelopArguments
+from service.computations.hand_held import HAND_BOARD, HAND_VIEW, HandViewAnswer
+from service.computations.image_poses import SfmEffort
 from service.computations.records import ArmCorrection, FurtherArm, Mounting, PosedPhotograph, image_of
-from service.computations.register import ARM
+from service.computations.registration import ARM, DETECT_SPHERES, DetectorName, DetectSpheresArguments
+from service.computations.scans import LOCATE_SPHERES
 from service.compute.photography import PARAMETERS
 from service.core.errors import ConfigurationError
 from service.core.jobs import Each, Reference
@@ -77,7 +80,7 @@ class RegistrationParams(StepParams):
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
     # The others search every image whole: "paper" is the published method without its networks, "grounded" has
     # Grounding DINO and SAM 2, and in "vote" it and the classical one must agree.
-    detector: detect_spheres.DetectorName = "classical"
+    detector: DetectorName = "classical"
     # Where outlines are measured once they are found. "raw" develops the raw file of each image first, which needs
     # the extra `raw` on the worker, and RAW+JPEG as the camera's `image_quality`. Further cameras that write no raw
     # files are measured in their JPEGs.
@@ -179,8 +182,8 @@ def search_for_spheres(context: StepContext, params: RegistrationParams) -> JobR
             where=f"step {context.step.id}",
             remedy="Set `hand_eye` of the step to the calibration, or `poses` to spheres, colmap or glomap",
         )
-    scan = context.earlier_answer(params.scan, locate_spheres.KIND)
-    calibration = context.earlier_answer(params.calibration, calibrate.KIND)
+    scan = context.earlier_answer(params.scan, LOCATE_SPHERES)
+    calibration = context.earlier_answer(params.calibration, CALIBRATE)
     mounting, references = _mounting(context, params, images)
     references |= {
         "camera": calibration.reference("camera"),
@@ -195,7 +198,7 @@ def search_for_spheres(context: StepContext, params: RegistrationParams) -> JobR
         known["colour"] = context.protocol.spheres.colour
     if params.measure_on == "raw":
         known["developed"] = developed(context, _exposures(context, images))
-    arguments = detect_spheres.Arguments(
+    arguments = DetectSpheresArguments(
         images=tuple(images),
         camera=calibration.answer.camera,
         spheres_m=scan.answer.spheres_m,
@@ -204,7 +207,7 @@ def search_for_spheres(context: StepContext, params: RegistrationParams) -> JobR
         detector=params.detector,
         **known,
     )
-    return JobRequest.of(detect_spheres.KIND, arguments, references)
+    return JobRequest.of(DETECT_SPHERES, arguments, references)
 
 
 def posed(images: Iterable[PosedPhotograph]) -> bool:
@@ -257,15 +260,15 @@ def with_robot_pose(photograph: PosedPhotograph, view: RecordedView) -> PosedPho
     return photograph
 
 
-def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer]:
+def held_views(context: StepContext, step_id: str) -> dict[str, HandViewAnswer]:
     """Return the worker's findings in the hand-held images of a step, by the SHA-256 of the photograph.
 
     Without a CT, each new image refines the poses of all: the newest ones are used.
     """
-    names = (hand_view.KIND.name, hand_board.KIND.name)
+    names = (HAND_VIEW.name, HAND_BOARD.name)
     done = [j for j in context.evidence.jobs(step_id) if j.kind in names and j.status == "finished"]
-    looks = {image_of(job).sha256: hand_view.KIND.read_answer(job.result) for job in done}
-    refined = hand_view.KIND.read_answer(done[-1].result).T_scene_cameras if done else {}
+    looks = {image_of(job).sha256: HAND_VIEW.read_answer(job.result) for job in done}
+    refined = HAND_VIEW.read_answer(done[-1].result).T_scene_cameras if done else {}
     return {
         sha256: look
         if look.viewpoint not in refined
@@ -328,7 +331,7 @@ def mounting_of(
 
 def _calibrated_arm(context: StepContext, step_id: str, stations: Sequence[str]) -> tuple[FurtherArm, References]:
     """Return one arm's hand-eye calibration with the stations at which it stood, and the references to it."""
-    found = context.earlier_answer(step_id, calibrate.KIND)
+    found = context.earlier_answer(step_id, CALIBRATE)
     if found.answer.T_flange_camera is None:
         raise ConfigurationError(
             f"step {step_id!r} has no hand-eye calibration",
@@ -351,21 +354,21 @@ def _calibrated_arm(context: StepContext, step_id: str, stations: Sequence[str])
 # --- developed raw files -------------------------------------------------------------------------------------------
 
 
-def developed(context: StepContext, exposures: Sequence[develop.Arguments]) -> dict[str, str]:
+def developed(context: StepContext, exposures: Sequence[DevelopArguments]) -> dict[str, str]:
     """Let the worker develop the raw file of each exposure of one camera; return the files by viewpoint."""
-    results = context.evidence.run_jobs(*(JobRequest.of(develop.KIND, exposure) for exposure in exposures))
+    results = context.evidence.run_jobs(*(JobRequest.of(DEVELOP, exposure) for exposure in exposures))
     return {one.viewpoint: result.artefacts[0].sha256 for one, result in zip(exposures, results, strict=True)}
 
 
-def exposure_of(viewpoint: str, files: Sequence[ArtefactRef]) -> develop.Arguments | None:
+def exposure_of(viewpoint: str, files: Sequence[ArtefactRef]) -> DevelopArguments | None:
     """Return how to develop the raw file among the files of an exposure; None without one."""
     raw = next((ref.sha256 for ref in files if ref.kind == "raw"), None)
     if raw is None:
         return None
-    return develop.Arguments(viewpoint=viewpoint, raw=raw, jpeg=files[0].sha256, parameters=PARAMETERS)
+    return DevelopArguments(viewpoint=viewpoint, raw=raw, jpeg=files[0].sha256, parameters=PARAMETERS)
 
 
-def _exposures(context: StepContext, images: Sequence[PosedPhotograph]) -> list[develop.Arguments]:
+def _exposures(context: StepContext, images: Sequence[PosedPhotograph]) -> list[DevelopArguments]:
     """Return how to develop the raw file of each photograph.
 
     Raises:

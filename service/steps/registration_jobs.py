@@ -16,19 +16,29 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from service.computations import (
-    detect_spheres,
-    features,
-    further_camera,
-    hybrid,
-    match,
-    register,
-    structure_from_motion,
+from service.computations.further_cameras import FURTHER_CAMERA, FirstCamera, FurtherCameraArguments
+from service.computations.image_poses import (
+    FEATURES,
+    HYBRID,
+    MATCH,
+    STRUCTURE_FROM_MOTION,
+    FeaturesArguments,
+    FrontEndArguments,
+    HybridArguments,
+    ImagesToMatch,
+    MatchArguments,
+    PairsToMatch,
+    StructureFromMotionArguments,
 )
-from service.computations.detect_spheres import SceneArguments
-from service.computations.features import FrontEndArguments
 from service.computations.kind import JobKind, JobRecord, read_part
 from service.computations.records import ImageFile, ImagesCamera, Matrix
+from service.computations.registration import (
+    DETECT_SPHERES,
+    REGISTER,
+    DetectSpheresArguments,
+    RegisterArguments,
+    SceneArguments,
+)
 from service.compute.sfm.options import Mapper, SfmOptions, pairs_of
 from service.core.jobs import Each, Jobs, Reference, arguments_name, jobs_of, newest_job, references_in
 from service.core.protocol import Protocol, Step
@@ -87,13 +97,11 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
     now = state.steps[step.id]
     if step.gives != "registrations" or now.skipped or all(note.note != PLANNED for note in now.notes):
         return None
-    begun = [
-        j for j in now.jobs.values() if j.kind == detect_spheres.KIND.name and not set(_REDUCED) & set(j.arguments)
-    ]
+    begun = [j for j in now.jobs.values() if j.kind == DETECT_SPHERES.name and not set(_REDUCED) & set(j.arguments)]
     if not begun:
         return None
     newest = max(begun, key=lambda job: job.enqueued_seq)
-    search = JobRequest(newest.kind, newest.arguments, detect_spheres.KIND.version, newest.priority)
+    search = JobRequest(newest.kind, newest.arguments, DETECT_SPHERES.version, newest.priority)
     return registration_jobs(state, step, decisive(protocol, step), search, name_of(newest))
 
 
@@ -115,7 +123,7 @@ def registration_jobs(
         root: the name of that job; jobs that use other images have another root in their names.
     """
     params, jobs = step.params_as(RegistrationParams), jobs_of(state)
-    arguments = detect_spheres.KIND.read_arguments(search.arguments, jobs)
+    arguments = DETECT_SPHERES.read_arguments(search.arguments, jobs)
     plan = _Plan(state, jobs, step.id, params, arguments, dict(references_in(search.arguments)), root)
     urgent = set(waited)
     arrived: dict[str, JobState] = {}
@@ -136,7 +144,7 @@ class _Plan:
     jobs: Jobs
     step: str
     params: RegistrationParams
-    search: detect_spheres.Arguments
+    search: DetectSpheresArguments
     references: Mapping[str, Reference | Each]  # those of the search, by field
     root: str
     tasks: dict[tuple[str, str], Task] = field(default_factory=dict[tuple[str, str], Task])
@@ -169,39 +177,39 @@ class _Plan:
             if first is None:
                 return None
             search = search.model_copy(update={"model": first[0]})
-        detected = self._need(detect_spheres.KIND, "", size, search)
+        detected = self._need(DETECT_SPHERES, "", size, search)
         if detected is None:
             return None
-        outlines = register.Arguments(**scene.set_fields(), outlines=detected.artefacts[0].sha256, poses=source)
+        outlines = RegisterArguments(**scene.set_fields(), outlines=detected.artefacts[0].sha256, poses=source)
         if source in QUICK:
             stated = outlines.model_copy(update={"state_pose_errors": True})
             arguments, references = self._uncorrected(stated) if source == "robot" else (stated, {})
-            return self._need(register.KIND, source, size, arguments, references)
+            return self._need(REGISTER, source, size, arguments, references)
         model = self._model(self._mapper(source), size, scene)
         if model is None:
             return None
         poses, tracks = model
         if source == "hybrid":
             # It starts from one reconstruction and adds the robot and the spheres.
-            start = hybrid.Arguments(**outlines.set_fields(), model=poses, tracks=tracks)
-            adjusted = self._need(hybrid.KIND, source, size, start)
+            start = HybridArguments(**outlines.set_fields(), model=poses, tracks=tracks)
+            adjusted = self._need(HYBRID, source, size, start)
             if adjusted is None:
                 return None
             known = {"model": adjusted.artefacts[0].sha256}
         else:
             known = {"model": poses, "tracks": tracks}
-        return self._need(register.KIND, source, size, outlines.model_copy(update=known))
+        return self._need(REGISTER, source, size, outlines.model_copy(update=known))
 
-    def _search_at(self, size: str) -> detect_spheres.Arguments:
+    def _search_at(self, size: str) -> DetectSpheresArguments:
         """Return the arguments of the search for outlines at a size; the other jobs share most of them."""
         fields = self.search.set_fields()
         fields.pop("model", None)  # present where the search itself needed poses from structure from motion
         if size:
             fields = {name: value for name, value in fields.items() if name not in _FULL_SIZE_ONLY}
             fields["reduced_to"] = _pixels(size)
-        return detect_spheres.Arguments(**fields)
+        return DetectSpheresArguments(**fields)
 
-    def _uncorrected(self, arguments: register.Arguments) -> tuple[register.Arguments, References]:
+    def _uncorrected(self, arguments: RegisterArguments) -> tuple[RegisterArguments, References]:
         """Return the arguments that take the arms' poses as they are reported, without references to corrections."""
         none: dict[str, Any] = {"arm_correction": None}
         if arguments.further_arms:
@@ -231,7 +239,7 @@ class _Plan:
         if pieces is None:
             return None
         found, matches = pieces
-        arguments = structure_from_motion.Arguments(
+        arguments = StructureFromMotionArguments(
             **scene.set_fields(),
             mappers=(mapper,),
             effort=self.params.structure_from_motion.effort,
@@ -239,7 +247,7 @@ class _Plan:
             features=found,
             matches=matches,
         )
-        made = self._need(structure_from_motion.KIND, mapper, size, arguments, {"prior": prior})
+        made = self._need(STRUCTURE_FROM_MOTION, mapper, size, arguments, {"prior": prior})
         if made is None:
             return None
         refs = {ref.original_name: ref.sha256 for ref in made.artefacts}
@@ -263,25 +271,23 @@ class _Plan:
         for some in _chunks(rest, _IMAGES_A_JOB):
             what = arguments_name({"images": [image.sha256 for image in some]})
             files = tuple(ImageFile(viewpoint=image.viewpoint, sha256=image.sha256) for image in some)
-            jobs.append(
-                self._need(features.KIND, what, size, features.Arguments(**shared.set_fields(), images=files))
-            )
+            jobs.append(self._need(FEATURES, what, size, FeaturesArguments(**shared.set_fields(), images=files)))
         made = [job for job in jobs if job is not None and job.status == "finished"]
         if len(made) < len(jobs):
             return None
         by_image: dict[str, str] = {}
         for job in made:
-            these = zip(read_part(features.ImagesToMatch, job.arguments).images, job.artefacts, strict=True)
+            these = zip(read_part(ImagesToMatch, job.arguments).images, job.artefacts, strict=True)
             by_image |= {image.sha256: ref.sha256 for image, ref in these}
         found = {image.viewpoint: by_image[image.sha256] for image in scene.images}
         matched: list[JobState | None] = [*early.matching(found)]
-        done = {pair for job in early.matching(found) for pair in read_part(match.PairsToMatch, job.arguments).pairs}
+        done = {pair for job in early.matching(found) for pair in read_part(PairsToMatch, job.arguments).pairs}
         known = {name: np.array(T) for name, T in (T_scan_camera or {}).items()}
         left = [p for p in pairs_of(found, known or None, SfmOptions(**effort.set_fields())) if p not in done]
         for pairs in _chunks(left, _PAIRS_A_JOB):
             mine = {name: found[name] for pair in pairs for name in pair}
-            arguments = match.Arguments(**shared.set_fields(), features=mine, pairs=tuple(pairs))
-            matched.append(self._need(match.KIND, arguments_name({"pairs": pairs}), size, arguments))
+            arguments = MatchArguments(**shared.set_fields(), features=mine, pairs=tuple(pairs))
+            matched.append(self._need(MATCH, arguments_name({"pairs": pairs}), size, arguments))
         finished = [job for job in matched if job is not None and job.status == "finished"]
         if len(finished) < len(matched):
             return None
@@ -311,7 +317,7 @@ class _Plan:
         return job if job is not None and job.status == "finished" else None
 
 
-_OF_SEARCH = detect_spheres.Arguments.model_fields.keys() - SceneArguments.model_fields.keys()
+_OF_SEARCH = DetectSpheresArguments.model_fields.keys() - SceneArguments.model_fields.keys()
 
 
 class _Located(JobRecord):
@@ -342,9 +348,7 @@ class _EarlyJobs:
     def matching(self, found: Mapping[str, str]) -> list[JobState]:
         """Return the jobs that matched exactly these features; `found` maps viewpoints to hashes of files."""
         return [
-            job
-            for job in self.matches
-            if read_part(match.PairsToMatch, job.arguments).features.items() <= found.items()
+            job for job in self.matches if read_part(PairsToMatch, job.arguments).features.items() <= found.items()
         ]
 
 
@@ -359,7 +363,7 @@ def _early_jobs(state: RunState, jobs: Jobs, wanted: FrontEndArguments) -> _Earl
             if shared.effort.plain() != wanted.effort.plain() or shared.camera.plain() != wanted.camera.plain():
                 continue
             if job.kind == "features":
-                early.features[read_part(features.ImagesToMatch, job.arguments).images[0].sha256] = job
+                early.features[read_part(ImagesToMatch, job.arguments).images[0].sha256] = job
             else:
                 early.matches.append(job)
     return early
@@ -409,7 +413,7 @@ def _of_camera(
 ) -> JobRequest:
     """Return the job for one camera; its newest calibration counts."""
     last = exposures[-1][1]
-    own = detect_spheres.KIND.read_arguments(search.arguments, jobs_of(context.evidence.state())).set_fields()
+    own = DETECT_SPHERES.read_arguments(search.arguments, jobs_of(context.evidence.state())).set_fields()
     taken = dict(references_in(search.arguments))
     references: References = {name: taken[name] for name in _SPHERES if name in taken}
     known = {name: own[name] for name in _SPHERES if name in own}
@@ -418,14 +422,14 @@ def _of_camera(
         known["developed"] = developed(context, [raw for raw in raws if raw is not None])
     if last.mounted == "rigid":
         job = registered[most_preferred(registered)]
-        answer = register.KIND.read_answer(job.result)
+        answer = REGISTER.read_answer(job.result)
         parts = {name: getattr(answer, name) for name in _OF_REGISTRATION}
         references |= {f"first/{name}": Reference(job.job, f"result/{name}") for name in _OF_REGISTRATION}
         if "intrinsics_covariance" in own:
             parts["intrinsics_covariance"] = own["intrinsics_covariance"]
             references["first/intrinsics_covariance"] = taken.get("intrinsics_covariance")
-        known["first"] = further_camera.FirstCamera(**parts)
-    arguments = further_camera.Arguments(
+        known["first"] = FirstCamera(**parts)
+    arguments = FurtherCameraArguments(
         device=last.device,
         mounted=last.mounted,
         images=tuple(
@@ -434,4 +438,4 @@ def _of_camera(
         calibration=last.calibration.sha256,
         **known,
     )
-    return JobRequest.of(further_camera.KIND, arguments, references)
+    return JobRequest.of(FURTHER_CAMERA, arguments, references)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.computations.calibrate.records import BoardSeen
+from service.computations.calibration import BoardSeen
 from service.computations.conversion import intrinsics_record, seen_board
 from service.compute.calibration import intrinsics_adjustment
 from service.compute.calibration.board import Board, BoardView

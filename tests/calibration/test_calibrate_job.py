@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.computations import calibrate
+from service.computations.calibration import CALIBRATE
 from service.computations.job import JobAnswer, JobContext, RecordedContext
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError
@@ -71,7 +71,7 @@ def _done(arguments: tuple[Store, dict[str, Any]], **other: Any) -> JobAnswer:
 @pytest.mark.slow
 def test_a_job_gives_the_bow_and_the_size_of_the_board(arguments: tuple[Store, dict[str, Any]]) -> None:
     done = _done(arguments)
-    answer = calibrate.KIND.read_answer(done.result)
+    answer = CALIBRATE.read_answer(done.result)
     assert done.measures["board_bow_mm"] == pytest.approx(0.1, abs=0.003)
     assert abs(done.measures["hand_eye_board_size_percent"]) < 0.2
     assert done.measures["hand_eye_findings"] == 0
@@ -105,4 +105,4 @@ def test_a_job_whose_board_has_another_size_fails_with_the_size_that_fits(
 def test_a_protocol_that_states_a_flat_board_gets_one(arguments: tuple[Store, dict[str, Any]]) -> None:
     done = _done(arguments, solve=["intrinsics"], flatness_mm=0.0)
     assert "board_bow_mm" not in done.measures
-    assert calibrate.KIND.version == 5
+    assert CALIBRATE.version == 5

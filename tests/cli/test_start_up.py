@@ -16,7 +16,7 @@ import pytest
 import typer
 
 from service.cli.main import app
-from service.computations import job_kinds
+from service.computations import SHARED_FOLDERS, job_kinds
 from service.core.loading import end_loading, loading
 from service.core.protocol import load_protocol
 from service.rig import load_rig
@@ -124,13 +124,19 @@ def test_drivers_processes_and_simulators_start_without_what_they_may_not_need(p
 
 
 @pytest.mark.parametrize(
-    ("package", "kinds"), [("service.computations", job_kinds), ("service.steps.kinds", step_kinds)]
+    ("package", "kinds", "shared"),
+    [("service.computations", job_kinds, SHARED_FOLDERS), ("service.steps.kinds", step_kinds, {})],
 )
-def test_a_kind_is_alone_in_the_module_of_its_name(package: str, kinds: Callable[[], Mapping[str, Any]]) -> None:
+def test_a_kind_is_declared_where_it_is_looked_for(
+    package: str, kinds: Callable[[], Mapping[str, Any]], shared: Mapping[str, tuple[str, ...]]
+) -> None:
     path = importlib.import_module(package).__path__
     places = [found.name for found in pkgutil.walk_packages(path, f"{package}.")]
+    folders = {name: folder for folder, names in shared.items() for name in names}
     for name, kind in kinds().items():
-        declared = [getattr(importlib.import_module(p), "KIND", None) for p in places if p.endswith(f".{name}")]
+        modules = [importlib.import_module(p) for p in places if p.endswith(f".{folders.get(name, name)}")]
+        kinds_there = [k for m in modules for k in (*vars(m).get("KINDS", ()), vars(m).get("KIND"))]
+        declared = [k for k in kinds_there if k is not None and (name not in folders or k.name == name)]
         assert declared == [kind], f"{name} would not be found without importing all kinds"
         assert kinds()[name] is kind
 
@@ -140,7 +146,7 @@ def test_a_kind_is_found_without_the_others() -> None:
         "import json, sys; from service.computations import job_kinds; assert job_kinds()['match'].name == 'match'; "
         "assert job_kinds().get('match') is job_kinds()['match']; print(json.dumps(sorted(sys.modules)))"
     )
-    assert "service.computations.match" in modules
+    assert "service.computations.image_poses" in modules
     assert "service.computations.fuse" not in modules
 
 

@@ -47,8 +47,8 @@ EDGES = {
     "service/dataset/descriptions.py": "writes croissant.json",
     "service/dataset/run_data_set.py": "writes dataset.json",
     "service/dataset/formats/radiance.py": "writes unit_box.json",
-    "service/computations/hand_view/answer.py": "writes and reads the file of a hand-held image",
-    "service/computations/live_view/station.py": "writes and reads the file of an image of the robot",
+    "service/computations/hand_held/compute.py": "writes and reads the file of a hand-held image",
+    "service/computations/live/compute.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/sfm/colmap_process.py": "messages of a child process",
     "service/compute/sfm/child.py": "messages of a child process",

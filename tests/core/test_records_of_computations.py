@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from service.computations import develop, evaluate
+from service.computations import evaluate
+from service.computations.further_cameras import DevelopAnswer, DevelopArguments
 from service.compute.photography import PARAMETERS, Crop
 from service.compute.scene import ControlSphere
 
@@ -29,7 +30,7 @@ ROW = {
 
 
 def test_a_development_is_written_with_the_keys_that_were_read() -> None:
-    arguments, answer = develop.Arguments.model_validate(DEVELOPED), develop.Answer.model_validate(ANSWER)
+    arguments, answer = DevelopArguments.model_validate(DEVELOPED), DevelopAnswer.model_validate(ANSWER)
     assert arguments.parameters == PARAMETERS
     assert answer.crop == Crop(10, 8, 1280, 853, "file")
     assert arguments.plain() == DEVELOPED

@@ -10,8 +10,8 @@ import pytest
 
 from service.audit.record.run import RecordedRun, read_run
 from service.audit.replay.recomputed import ScratchStore
-from service.computations import register
 from service.computations.job import JobAnswer
+from service.computations.registration import Registration
 from service.compute.matching.pairs import relative_covariance
 from service.core.run.state import JobState
 from service.dataset.run_data_set import data_set_of
@@ -51,7 +51,7 @@ def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, Ru
 def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, name: str, tmp_path: Path) -> None:
     answer, summary = stated(run, arm_jobs(run)[name], tmp_path)
     record = answer.answer
-    assert isinstance(record, register.Registration)
+    assert isinstance(record, Registration)
     assert record.pose_sigma_m is not None
     assert record.pose_sigma_rad is not None
     dataset = data_set_of(summary)
@@ -85,7 +85,7 @@ def test_the_outlines_of_each_image_are_in_the_covariance_of_poses_by_the_sphere
 ) -> None:
     answer, summary = stated(run, without_mount(arm_jobs(run)["robot"]), tmp_path)
     record = answer.answer
-    assert isinstance(record, register.Registration)
+    assert isinstance(record, Registration)
     assert record.pose_sigma_m is None
     assert record.leave_one_out is not None
     dataset = data_set_of(summary)
@@ -117,7 +117,7 @@ def test_a_job_of_before_locates_each_image_on_its_own(run: RecordedRun, tmp_pat
     job = without_mount(arm_jobs(run)["robot"])
     answer = computed(run, job, tmp_path, {})
     record = answer.answer
-    assert isinstance(record, register.Registration)
+    assert isinstance(record, Registration)
     assert [ref.kind for ref in answer.artefacts] == ["registration"]
     assert record.leave_one_out is None
     assert set(record.components) == {"outlines", "common", "poses", "spheres", "intrinsics"}

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial import KDTree
 
 from service.audit.record.run import read_run
-from service.computations import locate_spheres, register
+from service.computations.registration import REGISTER
+from service.computations.scans import LOCATE_SPHERES
 from service.core.geometry import apply, inverse
 from service.core.jobs import Reference, jobs_of, references_in, resolve
 from service.steps.kinds.ground_truth import with_located_images
@@ -31,9 +32,7 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
     images = with_located_images(of_scan, jobs).arguments["images"]
     assert {found.job for _, found in references_in(images) if isinstance(found, Reference)} == {of_scan.job}
     in_ct, in_scan = (
-        locate_spheres.KIND.read_answer(
-            next(job for job in jobs.values() if job.idempotency_key.startswith(key)).result
-        )
+        LOCATE_SPHERES.read_answer(next(job for job in jobs.values() if job.idempotency_key.startswith(key)).result)
         for key in ("ct_import/0/locate_spheres/", "scanning/0/locate_spheres/")
     )
     spheres = {
@@ -42,9 +41,7 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
         "sphere_covariance_m2": [sphere.covariance_m2 for sphere in in_ct.details.spheres],
     }
     of_ct = computed(run, of_scan, tmp_path, spheres)
-    T_world_scan, T_world_ct = (
-        np.array(register.KIND.read_answer(one.result).T_world_scan) for one in (answer, of_ct)
-    )
+    T_world_scan, T_world_ct = (np.array(REGISTER.read_answer(one.result).T_world_scan) for one in (answer, of_ct))
     T_scan_ct = inverse(T_world_scan) @ T_world_ct
     assert np.linalg.norm(T_scan_ct[:3, 3]) > 0.01  # the frames are not the same
     distance_m, _ = KDTree(apply(T_scan_ct, np.array(in_ct.spheres_m))).query(np.array(in_scan.spheres_m))

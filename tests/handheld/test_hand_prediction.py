@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.computations import hand_view as job
-from service.computations.hand_view.answer import HandGuide, HandheldImage
+from service.computations.hand_held import HandViewArguments
+from service.computations.hand_held.compute import HandGuide, HandheldImage
+from service.computations.inputs import CaptureScene
 from service.computations.records import Camera, Limits
-from service.computations.scene import CaptureScene
 from service.compute.planning.coverage import CoverageLimits, predicted_information
 from service.core.geometry import apply, inverse
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, scene
@@ -40,7 +40,7 @@ def taken() -> list[HandheldImage]:
 def predicted_mm(**counted: object) -> float:
     images = taken()
     place = {"name": "a", "tilt_deg": 20, "azimuth_deg": 0, "distance_m": 0.6, "walk_round": True}
-    arguments = job.Arguments.model_validate(
+    arguments = HandViewArguments.model_validate(
         {
             "places": [{**place, "aim_m": [0, 0, 0]}],
             "within_deg": 10, "first_words": "", "limits": Limits(max_angle_deg=60, max_distance_m=1, min_views=2),

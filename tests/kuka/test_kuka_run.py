@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
-from service.computations import calibrate
+from service.computations.calibration import CALIBRATE, CalibrateAnswer
 from service.core.records.run_events import JobEnqueued, ViewpointCaptured
 from tests.support.protocols.small_demo import COARSE
 from tests.support.protocols.two_arms import FIRST, SECOND, for_two_arms, kuka_demo
@@ -87,13 +87,13 @@ def test_its_errors_are_those_of_a_good_data_set(run: Run) -> None:
 
 def test_each_arm_has_a_correction_of_seven_joints_of_its_own(run: Run) -> None:
     steps = run.ended.summary.state.steps
-    found: list[calibrate.Answer] = []
+    found: list[CalibrateAnswer] = []
     for name in (FIRST, SECOND):
         calibrated = steps[name].measures
         assert calibrated["hand_eye_arm_corrected"] == 1.0
         assert calibrated["hand_eye_held_out_mm"] < 0.7 * calibrated["hand_eye_uncorrected_held_out_mm"]
         assert np.isfinite(calibrated["hand_eye_sigma_mm"])
-        found.append(calibrate.KIND.read_answer(steps[name].result or {}))
+        found.append(CALIBRATE.read_answer(steps[name].result or {}))
     corrections = [one.hand_eye.arm_correction for one in found if one.hand_eye is not None]
     deltas = [np.array(one.dh_deltas) for one in corrections if one is not None]
     assert [one.shape for one in deltas] == [(7, 5), (7, 5)]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.computations import detect_spheres
 from service.computations.inputs import robot_camera_poses
 from service.computations.records import FurtherArm, Mounting, PosedPhotograph, matrix
+from service.computations.registration import DETECT_SPHERES, DetectSpheresArguments
 from service.core.geometry import Array
 from service.core.jobs import Reference
 from service.steps.context import JobRequest
@@ -37,8 +37,8 @@ def test_the_mount_of_a_further_arm_is_recorded_as_a_reference() -> None:
     second = FurtherArm(T_flange_camera=matrix(shifted(0.2)), stations=("station_2",))
     mounting = Mounting(T_flange_camera=matrix(shifted(0.1)), further_arms=(second,))
     reference = Reference("job-7", "result/T_flange_camera")
-    arguments = detect_spheres.Arguments.model_construct(**mounting.set_fields())
-    request = JobRequest.of(detect_spheres.KIND, arguments, {"further_arms/0/T_flange_camera": reference})
+    arguments = DetectSpheresArguments.model_construct(**mounting.set_fields())
+    request = JobRequest.of(DETECT_SPHERES, arguments, {"further_arms/0/T_flange_camera": reference})
     assert request.arguments["further_arms"] == [
         {"T_flange_camera": reference.record(), "stations": ["station_2"]},
     ]

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from service.computations import board_view, calibrate
+from service.computations.calibration import BoardViewAnswer, CalibrateAnswer, CalibrationDetails
 from service.computations.records import Camera
 from service.core.errors import ComputeError
 from service.core.records.run_events import (
@@ -37,9 +37,9 @@ CALIBRATION = """\
           arcs: [{tilt_deg: 20, azimuth_from_deg: 0, azimuth_to_deg: 0, count: 1, distance_m: 0.6}]
     gates: [{measure: rms_px, max: 0.5}]
 """
-NO_BOARD = board_view.Answer(viewpoint="b1", size=(640, 426), seen=False, reason="no board").plain()
+NO_BOARD = BoardViewAnswer(viewpoint="b1", size=(640, 426), seen=False, reason="no board").plain()
 _CAMERA = Camera(width=640, height=426, fx=930.0, fy=930.0, cx=320.0, cy=213.0)
-SOLVED = calibrate.Answer(camera=_CAMERA, details=calibrate.CalibrationDetails()).plain()
+SOLVED = CalibrateAnswer(camera=_CAMERA, details=CalibrationDetails()).plain()
 
 
 # --- bad days --------------------------------------------------------------------------------------------

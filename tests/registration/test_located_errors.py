@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.computations import register
 from service.computations.job import JobContext, RecordedContext
+from service.computations.registration import POSE_ERRORS, REGISTER, Registration
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_record
 from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
@@ -42,7 +42,7 @@ class Located:
         true: (4, 4) T_scan_camera by viewpoint.
     """
 
-    record: register.Registration
+    record: Registration
     names: list[str]
     covariance: Array
     true: dict[str, Transform]
@@ -124,13 +124,13 @@ def located(folder: Path, seed: int, *, by_hand: bool) -> Located:
         )
         asked = arguments(made, outlines.sha256, centres, held(made, rng) if by_hand else None)
         context: RecordedContext = JobContext(asked, store, folder, lambda *_: None)
-        answer = HANDLERS[register.KIND.name](context)
-        (ref,) = (ref for ref in answer.artefacts if ref.kind == register.POSE_ERRORS)
+        answer = HANDLERS[REGISTER.name](context)
+        (ref,) = (ref for ref in answer.artefacts if ref.kind == POSE_ERRORS)
         with np.load(io.BytesIO(store.artefact_path(ref.sha256).read_bytes()), allow_pickle=False) as archive:
             names, covariance = json.loads(str(archive["names"])), archive["covariance"]
     T_scan_camera = inverse(made.T_world_scan) @ made.T_world_camera
     true = {f"v{i}": T for i, T in enumerate(T_scan_camera)}
-    return Located(register.KIND.read_answer(answer.result), names, covariance, true)
+    return Located(REGISTER.read_answer(answer.result), names, covariance, true)
 
 
 @pytest.fixture(

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import CameraSettings
-from service.computations import live_view
 from service.computations.conversion import arm_correction_record
 from service.computations.inputs import robot_camera_poses
 from service.computations.job import JobAnswer, JobContext, RecordedContext
+from service.computations.live import LIVE_VIEW
 from service.compute.arm_kinematics import ArmCorrection, corrected_T_base_flange, postures
 from service.compute.live import LiveView, clipped_fraction, register_station, sharpness
 from service.compute.markers.predicted import NEAR, ImageOutlines, PredictedSpheres, find_outlines, tone_of
@@ -274,7 +274,7 @@ def measured_run(
     usual = HANDLERS["live_view"]
 
     def look(context: RecordedContext) -> JobAnswer:
-        arguments = live_view.KIND.read_arguments(context.arguments)
+        arguments = LIVE_VIEW.read_arguments(context.arguments)
         here[:] = robot_camera_poses(arguments, [arguments.image])
         return usual(context)
 
@@ -289,7 +289,7 @@ def measured_run(
         compute_jobs(bench.store)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
-    monkeypatch.setattr("service.computations.live_view.compute.find_outlines", exactly)
+    monkeypatch.setattr("service.computations.live.compute.find_outlines", exactly)
     bench.operator.on_show = serve
     return bench
 
@@ -483,7 +483,7 @@ def test_an_image_that_is_judged_late_is_taken_again_and_one_that_is_spoilt_agai
     def look(context: RecordedContext) -> JobAnswer:
         """Judge both images of v001 black, and the first of v003."""
         answer = usual(context)
-        name = live_view.KIND.read_arguments(context.arguments).image.viewpoint
+        name = LIVE_VIEW.read_arguments(context.arguments).image.viewpoint
         looked_at.append(name)
         black = name == "v001" or (name == "v003" and looked_at.count(name) == 1)
         return replace(answer, answer=answer.answer.model_copy(update={"black": black}))

@@ -13,8 +13,8 @@ from typing import Any, cast
 import numpy as np
 
 from service.audit.record.run import RecordedFiles
-from service.computations import register
 from service.computations.job import JobAnswer
+from service.computations.registration import ARM, REGISTER
 from service.compute.registration.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.jobs import Reference, computed_by, jobs_of, resolve
@@ -147,13 +147,13 @@ def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
     centre_m = np.array(spheres, dtype=np.float64).mean(axis=0)
     for pair in recomputed.pairs:
         of_scan = summary.protocol.step(pair.step).gives == "registrations"  # the ground truth registers the CT, too
-        if pair.before.kind != register.KIND.name or not of_scan:
+        if pair.before.kind != REGISTER.name or not of_scan:
             continue
-        before, after = (register.KIND.read_answer(job.result) for job in (pair.before, pair.now))
+        before, after = (REGISTER.read_answer(job.result) for job in (pair.before, pair.now))
         shared = sorted(before.T_scan_camera.keys() & after.T_scan_camera.keys())
         moved, given = (np.array([each.T_scan_camera[name] for name in shared]) for each in (after, before))
         in_world: float | None = None
-        if before.poses in register.ARM:  # the world is the base of the first station
+        if before.poses in ARM:  # the world is the base of the first station
             places = [apply(np.array(each.T_world_scan), centre_m) for each in (before, after)]
             in_world = mm(float(np.linalg.norm(places[1] - places[0])))
         yield Drift(before.poses, in_world, mm(true_error_m(moved, given, centre_m)))

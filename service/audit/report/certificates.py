@@ -28,8 +28,9 @@ from service.audit.report.blocks import (
     measured,
     utc,
 )
-from service.computations import calibrate
-from service.computations.calibrate.records import (
+from service.computations.calibration import (
+    CALIBRATE,
+    CalibrateAnswer,
     Coverage,
     HandEye,
     Intrinsics,
@@ -195,7 +196,7 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
         state = run.state.steps[step.id]
         kept = [ref for ref in state.artefacts if ref.kind == "calibration"]
         if step.gives == "calibration" and state.result and kept:
-            solved = calibrate.KIND.read_answer(state.result)
+            solved = CALIBRATE.read_answer(state.result)
             blocks = (
                 _facts(run, step.id, kept[-1].sha256, solved),
                 *(
@@ -209,7 +210,7 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
             yield Section(f"Calibration certificate: {step.title}", blocks)
 
 
-def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer) -> DescriptionList:
+def _facts(run: RecordedRun, step_id: str, sha256: str, solved: CalibrateAnswer) -> DescriptionList:
     state = run.state.steps[step_id]
     first = next((run.events[seq - 1].payload for seq in sorted(state.captured.values())), None)
     camera = first.optics if isinstance(first, RecordedView) else RecordedOptics()
@@ -266,7 +267,7 @@ def _median_mm(residuals: Residuals) -> float:
     return float(np.median(list(residuals.held_out_mm.values())))
 
 
-def _intrinsics(solved: calibrate.Answer) -> Iterator[Block]:
+def _intrinsics(solved: CalibrateAnswer) -> Iterator[Block]:
     record, camera = solved.details.intrinsics, solved.camera
     if record is None:
         return
@@ -300,7 +301,7 @@ def _parameters(camera: Camera, record: Intrinsics) -> Table:
     return Table((*columns, *columns), tuple((*a, *b) for a, b in pairs))
 
 
-def _hand_eye(solved: calibrate.Answer) -> Iterator[Block]:
+def _hand_eye(solved: CalibrateAnswer) -> Iterator[Block]:
     record = solved.hand_eye
     if record is None:
         return

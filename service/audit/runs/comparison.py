@@ -9,7 +9,7 @@ from datetime import datetime
 
 import numpy as np
 
-from service.computations import calibrate
+from service.computations.calibration import CALIBRATE
 from service.computations.evaluate import Row
 from service.computations.records import Camera
 from service.core.gates import figure, limits, quantity, standing
@@ -232,7 +232,7 @@ def _calibrated(run: ComparedRun) -> _Calibrated:
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         if step.gives == "calibration" and state.result:
-            answer = calibrate.KIND.read_answer(state.result)
+            answer = CALIBRATE.read_answer(state.result)
             camera = answer.camera
             if answer.T_flange_camera is not None:
                 T_flange_camera = np.array(answer.T_flange_camera, dtype=np.float64)

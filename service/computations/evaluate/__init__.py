@@ -8,7 +8,7 @@ from pydantic import Field
 
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import PosedPhotograph, SpheresFound
-from service.computations.register import Registration
+from service.computations.registration import Registration
 from service.compute.scene import ControlSphere
 from service.machine.resources import IMAGE_MB, processes_for
 

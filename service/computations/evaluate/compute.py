@@ -12,11 +12,10 @@ import numpy as np
 
 from service.computations import evaluate as job
 from service.computations.conversion import camera_of
-from service.computations.detect_spheres.compute import read_outlines
-from service.computations.inputs import photographs_at
+from service.computations.inputs import photographs_at, read_outlines
 from service.computations.job import JobAnswer, JobContext
 from service.computations.records import Hash, PosedPhotograph, SpheresFound
-from service.computations.register import Registration
+from service.computations.registration import Registration
 from service.compute.camera_model import CameraModel
 from service.compute.images.photographs import read_image
 from service.compute.images.resample import resample

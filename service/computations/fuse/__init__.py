@@ -6,7 +6,7 @@ from typing import Literal
 
 from service.computations.kind import Demand, JobKind, JobRecord
 from service.computations.records import Hash, Matrix, Point, SpheresFound
-from service.computations.register import Registration
+from service.computations.registration import Registration
 
 Frame = Literal["world", "scan", "ct"]
 

@@ -7,8 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from service.computations import calibrate
-from service.computations.calibrate.records import HandEye, KnownBoard
+from service.computations.calibration import (
+    CALIBRATE,
+    CalibrateAnswer,
+    CalibrateArguments,
+    CalibrationDetails,
+    HandEye,
+    KnownBoard,
+)
 from service.computations.records import Camera, Matrix, matrix
 from service.core.errors import ConfigurationError
 from service.core.records.base import Record
@@ -144,7 +150,7 @@ class Result(Record):
     T_base_board: Matrix | None = None
     hand_eye: HandEye | None = None  # covariance, residuals, methods, the arm's correction
     robots: tuple[str, ...] = ()  # robots that carried the camera
-    details: calibrate.CalibrationDetails
+    details: CalibrationDetails
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -184,7 +190,7 @@ def board_of_protocol(context: StepContext) -> Board:
     return Board(board.columns, board.rows, metres(board.square_mm))
 
 
-def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Answer] | None:
+def _camera(context: StepContext, params: Params) -> EarlierAnswer[CalibrateAnswer] | None:
     """Return the answer with the intrinsics of an earlier step, if this one does not solve them."""
     if "intrinsics" in params.solve:
         return None
@@ -192,11 +198,11 @@ def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Ans
         raise ConfigurationError(
             "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
         )
-    return context.earlier_answer(params.intrinsics_of, calibrate.KIND)
+    return context.earlier_answer(params.intrinsics_of, CALIBRATE)
 
 
 def _board_capture(
-    context: StepContext, params: Params, board: Board, camera: EarlierAnswer[calibrate.Answer] | None
+    context: StepContext, params: Params, board: Board, camera: EarlierAnswer[CalibrateAnswer] | None
 ) -> BoardCapture:
     from service.steps.board_capture import BoardCapture  # noqa: PLC0415 - as above
 
@@ -228,7 +234,7 @@ def _solve(
     context: StepContext,
     params: Params,
     board: Board,
-    camera: EarlierAnswer[calibrate.Answer] | None,
+    camera: EarlierAnswer[CalibrateAnswer] | None,
     capture: BoardCapture | None,
 ) -> JobResult:
     from service.steps.board_capture import board_arguments  # noqa: PLC0415 - as above
@@ -236,7 +242,7 @@ def _solve(
     images = captured_images(context, [params.images_of or context.step.id])
     looks = {} if capture is None else {look.capture.artefacts[0].sha256: look for look in capture.looks()}
     images = [image for image in images if image.sha256 not in looks or not looks[image.sha256].spoilt]
-    arguments = calibrate.Arguments(
+    arguments = CalibrateArguments(
         solve=params.solve,
         images=tuple(images),
         **board_arguments(board),
@@ -251,11 +257,11 @@ def _solve(
             known = None
         more = {"corners": corners, "known": None if known is None else _known(known)}
         arguments = arguments.model_copy(update=more)
-    (answer,) = context.evidence.run_jobs(JobRequest.of(calibrate.KIND, arguments, references))
+    (answer,) = context.evidence.run_jobs(JobRequest.of(CALIBRATE, arguments, references))
     return answer
 
 
-def _stated_of_board(context: StepContext, camera: EarlierAnswer[calibrate.Answer] | None) -> dict[str, Any]:
+def _stated_of_board(context: StepContext, camera: EarlierAnswer[CalibrateAnswer] | None) -> dict[str, Any]:
     """Return what the protocol and the camera's calibration say of the board, as far as they do."""
     board = context.protocol.board
     stated: dict[str, Any] = {}

@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from drivers.interfaces import CtSeries, CtSource, CtVolume
-from service.computations import ct_surface, locate_spheres
 from service.computations.records import Point, SphereDetails
+from service.computations.scans import CT_SURFACE, LOCATE_SPHERES, CtSurfaceArguments, LocateSpheresArguments
 from service.core.errors import DataError
 from service.core.records.base import ArtefactRef, Record
 from service.core.step_params import NeededDevice, RepeatedStep, StepParams
@@ -84,8 +84,8 @@ def _mesh(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Artef
     scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh", ct.report))
     mesh, kept = keep_mesh(context, scan, device="ct", kind="ct_mesh")
     radius_m = metres(context.protocol.spheres.radius_mm)
-    arguments = locate_spheres.Arguments(mesh=mesh.sha256, radius_m=radius_m, expected=params.spheres)
-    return JobRequest.of(locate_spheres.KIND, arguments), kept, {}
+    arguments = LocateSpheresArguments(mesh=mesh.sha256, radius_m=radius_m, expected=params.spheres)
+    return JobRequest.of(LOCATE_SPHERES, arguments), kept, {}
 
 
 def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:
@@ -96,7 +96,7 @@ def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Art
     labels, found = _labels(context, params, volume)
     kept = keep_clean(context, ct, series.files, device="ct", kind="ct_slice")
     array = keep_array(context, volume.hounsfield, device="ct", kind="ct_volume", name="hounsfield.npy")
-    arguments = ct_surface.Arguments(
+    arguments = CtSurfaceArguments(
         radius_m=metres(context.protocol.spheres.radius_mm),
         expected=params.spheres,
         slices=tuple(ref.sha256 for ref in kept),
@@ -115,7 +115,7 @@ def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Art
         "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # DICOM gives positions with six decimal places
         "voxel_mm": round(mm(max(volume.spacing_m)), 6),
     }
-    return JobRequest.of(ct_surface.KIND, arguments), kept + labels, measures
+    return JobRequest.of(CT_SURFACE, arguments), kept + labels, measures
 
 
 def _labels(

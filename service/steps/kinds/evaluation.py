@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from service.computations import evaluate, locate_spheres, register
+from service.computations import evaluate
+from service.computations.registration import REGISTER, Registrations
+from service.computations.scans import LOCATE_SPHERES
 from service.core.errors import ConfigurationError
 from service.core.jobs import Reference
 from service.core.records.base import Record
@@ -80,17 +82,15 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Let the worker evaluate every registration that has arrived on the control spheres."""
-    registrations = dict(context.earlier_result(params.registration, register.Registrations).registrations)
+    registrations = dict(context.earlier_result(params.registration, Registrations).registrations)
     references: dict[str, Reference | None] = {}
     found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(params.registration))
     arrived = {} if found is None else found.arrived
-    registrations |= {name: register.KIND.read_answer(job.result) for name, job in arrived.items()}
+    registrations |= {name: REGISTER.read_answer(job.result) for name, job in arrived.items()}
     references |= {f"registrations/{name}": Reference(job.job, "result") for name, job in arrived.items()}
     scans = {_SCAN: params.scan, _CONTROL: params.control_scan, _CT: params.ct}
     measured = {
-        name: None
-        if step is None or step in context.run.skipped
-        else context.earlier_answer(step, locate_spheres.KIND)
+        name: None if step is None or step in context.run.skipped else context.earlier_answer(step, LOCATE_SPHERES)
         for name, step in scans.items()
     }
     references |= {name: found.reference("") for name, found in measured.items() if found is not None}

@@ -10,9 +10,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from service.computations import fuse, locate_spheres, register
+from service.computations import fuse
 from service.computations.kind import read_part
 from service.computations.records import Mounting, Point, PosedPhotograph, has_poses
+from service.computations.registration import REGISTER
+from service.computations.scans import LOCATE_SPHERES
 from service.core.errors import ConfigurationError
 from service.core.jobs import Each, Jobs, Reference, jobs_of
 from service.core.records.base import Record
@@ -47,13 +49,13 @@ def with_located_images(registered: JobState, jobs: Jobs) -> JobRequest:
     recorded = dict(registered.arguments)
     known = read_part(_Posed, recorded, jobs)
     if known.poses == "spheres" and not has_poses(known, known.images):
-        found = register.KIND.read_answer(registered.result).T_scan_camera
+        found = REGISTER.read_answer(registered.result).T_scan_camera
         recorded["images"] = [
             image.plain() | {"T_scene_camera": Reference(registered.job, f"result/T_scan_camera/{name}").record()}
             for image in known.images
             if (name := image.viewpoint) in found
         ]
-    return JobRequest(register.KIND.name, recorded, version=register.KIND.version)
+    return JobRequest(REGISTER.name, recorded, version=REGISTER.version)
 
 
 # Sources of poses that place each mesh by its own spheres, the more certain ones first.
@@ -150,8 +152,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     skipped = next((step for step in (params.ct, params.scan) if step in context.run.skipped), None)
     if skipped is not None:
         return StepOutcome(Measures(), (), Result(without=skipped))
-    ct = context.earlier_answer(params.ct, locate_spheres.KIND)
-    scan = context.earlier_answer(params.scan, locate_spheres.KIND)
+    ct = context.earlier_answer(params.ct, LOCATE_SPHERES)
+    scan = context.earlier_answer(params.scan, LOCATE_SPHERES)
     arguments = fuse.Arguments(
         ct_mesh=context.earlier_artefact(params.ct, "ct_mesh").sha256,
         scan_mesh=context.earlier_artefact(params.scan, "scan_mesh").sha256,
@@ -171,7 +173,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         name, of_scan, of_ct = _registrations(context, params.registration, ct)
         both = {"ct_registration": of_ct, "scan_registration": of_scan}
         arguments = arguments.model_copy(
-            update={field: register.KIND.read_answer(job.result) for field, job in both.items()}
+            update={field: REGISTER.read_answer(job.result) for field, job in both.items()}
         )
         references |= {field: Reference(job.job, "result") for field, job in both.items()}
     (answer,) = context.evidence.run_jobs(JobRequest.of(fuse.KIND, arguments, references))
@@ -242,9 +244,9 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
     for field, path in references.items():
         reference = ct.reference(path)
         recorded[field] = of_ct[field] if reference is None else reference.record()
-    request = JobRequest(register.KIND.name, recorded, version=register.KIND.version)
+    request = JobRequest(REGISTER.name, recorded, version=REGISTER.version)
     context.evidence.run_jobs(request)
-    jobs = [job for job in context.evidence.jobs(context.step.id) if job.kind == register.KIND.name]
+    jobs = [job for job in context.evidence.jobs(context.step.id) if job.kind == REGISTER.name]
     return name, mine, next(job for job in reversed(jobs) if job.status == "finished")
 
 

@@ -12,8 +12,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.computations import detect_spheres, further_camera, register, term
-from service.computations.register import Registration
+from service.computations import term
+from service.computations.further_cameras import FURTHER_CAMERA, FurtherCameraAnswer
+from service.computations.registration import DETECT_SPHERES, REGISTER, Registration
 from service.core.errors import ComputeError
 from service.core.jobs import arguments_name
 from service.core.records.base import Record
@@ -73,9 +74,7 @@ class Result(Record):
 
     outlines_sha256: str
     registrations: dict[str, Registration]
-    cameras: dict[str, further_camera.Answer] = Field(
-        default_factory=dict[str, further_camera.Answer]
-    )  # further ones
+    cameras: dict[str, FurtherCameraAnswer] = Field(default_factory=dict[str, FurtherCameraAnswer])  # further ones
 
 
 def execute(context: StepContext, params: RegistrationParams) -> StepOutcome:
@@ -121,12 +120,12 @@ def _words(found: RegistrationJobs) -> str:
 def _outcome(found: RegistrationJobs) -> StepOutcome:
     """Return the registrations so far, including any that arrived although the step did not wait for them."""
     done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
-    outlines = next(job for task, job in done if task.request.kind == detect_spheres.KIND.name)
+    outlines = next(job for task, job in done if task.request.kind == DETECT_SPHERES.name)
     registrations = {name: OneRegistration.read(job.measures) for name, job in found.arrived.items()}
     measures = Measures.read(outlines.measures).model_copy(update={"registrations": registrations})
     result = Result(
         outlines_sha256=outlines.artefacts[0].sha256,
-        registrations={name: register.KIND.read_answer(job.result) for name, job in found.arrived.items()},
+        registrations={name: REGISTER.read_answer(job.result) for name, job in found.arrived.items()},
     )
     artefacts = tuple(ref for _, job in done for ref in job.artefacts)
     sources = (ComputedBy(job=job.job, prefix=f"{name}_") for name, job in found.arrived.items())
@@ -155,7 +154,7 @@ def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]
         "further_views": min(m["views"] for m in measured),
         "further_excluded": sum(m["excluded"] for m in measured),
     }
-    cameras = {name: further_camera.KIND.read_answer(job.result) for name, job in located.items()}
+    cameras = {name: FURTHER_CAMERA.read_answer(job.result) for name, job in located.items()}
     assert isinstance(outcome.result, Result)
     return replace(
         outcome,

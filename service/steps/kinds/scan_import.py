@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from drivers.interfaces import ScanExport
-from service.computations import locate_spheres, merge_scans
 from service.computations.records import Point, SphereDetails
+from service.computations.scans import LOCATE_SPHERES, MERGE_SCANS, LocateSpheresArguments, MergeScansArguments
 from service.core.jobs import Reference
 from service.core.records.base import ArtefactRef, Record, elapsed
 from service.core.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
@@ -117,7 +117,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     request = _request(context, params, [mesh for mesh, _ in pairs])
     (answer,) = context.evidence.run_jobs(request)
     if params.parts > 1:
-        merged = merge_scans.KIND.read_answer(answer.result)
+        merged = MERGE_SCANS.read_answer(answer.result)
         context.note("parts merged", T_mesh_part=merged.T_mesh_part)
         result = Result(spheres_m=merged.spheres_m, details=merged.details)
     else:
@@ -188,27 +188,27 @@ def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) ->
     """Return the search in the only mesh, or the merging of several and the search in what results."""
     arguments, references = _arguments(context, params, meshes[0])
     if len(meshes) == 1:
-        return JobRequest.of(locate_spheres.KIND, arguments, references)
-    merging = merge_scans.Arguments(
+        return JobRequest.of(LOCATE_SPHERES, arguments, references)
+    merging = MergeScansArguments(
         meshes=tuple(mesh.sha256 for mesh in meshes),
         radius_m=arguments.radius_m,
         expected=arguments.expected,
         reference_m=arguments.reference_m,
         reference_covariances_m2=arguments.reference_covariances_m2,
     )
-    return JobRequest.of(merge_scans.KIND, merging, references)
+    return JobRequest.of(MERGE_SCANS, merging, references)
 
 
 def _arguments(
     context: StepContext, params: Params, mesh: ArtefactRef
-) -> tuple[locate_spheres.Arguments, dict[str, Reference | None]]:
+) -> tuple[LocateSpheresArguments, dict[str, Reference | None]]:
     """Return the arguments of the search, with the spheres to compare with, and the references to these."""
-    arguments = locate_spheres.Arguments(
+    arguments = LocateSpheresArguments(
         mesh=mesh.sha256, radius_m=metres(context.protocol.spheres.radius_mm), expected=params.spheres
     )
     if params.compare_with is None or params.compare_with in context.run.skipped:
         return arguments, {}
-    earlier = context.earlier_answer(params.compare_with, locate_spheres.KIND)
+    earlier = context.earlier_answer(params.compare_with, LOCATE_SPHERES)
     compared = {
         "reference_m": earlier.answer.spheres_m,
         "reference_covariances_m2": tuple(sphere.covariance_m2 for sphere in earlier.answer.details.spheres),

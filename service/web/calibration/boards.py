@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from service.computations.calibrate.records import ArmAnswer, HandEye
+from service.computations.calibration import ArmAnswer, HandEye
 from service.computations.conversion import corrected_mounting
 from service.computations.records import Camera
 from service.compute.arm_kinematics import corrected_T_base_flange, nearest_posture

@@ -8,8 +8,7 @@ from statistics import median
 
 from pydantic import BaseModel
 
-from service.computations import calibrate
-from service.computations.calibrate.records import ArmAnswer, HandEye, Intrinsics, Residuals
+from service.computations.calibration import CALIBRATE, ArmAnswer, HandEye, Intrinsics, Residuals
 from service.computations.records import Camera
 from service.core.protocol import Step
 from service.core.recorded_devices import RecordedIdentity, recorded_report
@@ -91,7 +90,7 @@ def calibration_of(log: RunRecord) -> Calibration | None:
     ]
     if not solved:
         return None
-    answers = [calibrate.KIND.read_answer(state.result) for _, state in solved]
+    answers = [CALIBRATE.read_answer(state.result) for _, state in solved]
     intrinsics = [answer.details.intrinsics for answer in answers if answer.details.intrinsics is not None]
     hand_eyes = [
         (answer.hand_eye, _Robots.model_validate(state.result).robots)

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
-from service.computations.live_summary import Suggestion
+from service.computations.live import Suggestion
 from service.core.protocol import Step
 from service.followed_run import RunRecord
 from service.people.control import Control

@@ -10,7 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from service.computations import further_view, live_summary, live_view
+from service.computations.further_cameras import FURTHER_VIEW
+from service.computations.live import LIVE_SUMMARY, LIVE_VIEW, Suggestion
 from service.core.gates import limits
 from service.core.protocol import Protocol, Step
 from service.core.records.run_events import OperatorAction, RecordedOptics, ViewpointCaptured
@@ -230,7 +231,7 @@ def looked_at(
         figures += f", {expected:.0f} expected whole in the image"
     reason = "" if live is None else live.message
     if live is not None and live.status == "finished":
-        kind = live_view.KIND if live.kind == live_view.KIND.name else further_view.KIND
+        kind = LIVE_VIEW if live.kind == LIVE_VIEW.name else FURTHER_VIEW
         reason = kind.read_answer(live.result).reason or live.message
     out.append(Verdict("Spheres", seen, words[seen], f"{figures}; {reason}".strip("; ") if reason else figures))
 
@@ -317,14 +318,14 @@ def redo_of(log: RunRecord, step: Step, view: StepViewpoint, account: str) -> Vi
     )
 
 
-def suggestions_of(log: RunRecord, step: Step) -> tuple[str, tuple[live_summary.Suggestion, ...]]:
+def suggestions_of(log: RunRecord, step: Step) -> tuple[str, tuple[Suggestion, ...]]:
     """Say what the step's images lack and which views would help most; empty if they lack nothing."""
     state = log.state.steps[step.id]
     notes = suggested_views(state)
     if notes:
         return notes[-1].advice, notes[-1].viewpoints
-    jobs = [job for job in state.jobs.values() if job.kind == live_summary.KIND.name and job.status == "finished"]
-    return "", live_summary.KIND.read_answer(jobs[-1].result).next_best_views if jobs else ()
+    jobs = [job for job in state.jobs.values() if job.kind == LIVE_SUMMARY.name and job.status == "finished"]
+    return "", LIVE_SUMMARY.read_answer(jobs[-1].result).next_best_views if jobs else ()
 
 
 _FEWEST_SPHERES = 4  # that locate a further camera

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from service.computations import coverage_points, hand_board, hand_view
+from service.computations.hand_held import HAND_BOARD, HAND_VIEW, PlaceStatus
+from service.computations.live import COVERAGE_POINTS
 from service.computations.records import Matrix, image_of
 from service.core.gates import quantity
 from service.core.measure_names import measure_name
@@ -26,7 +27,7 @@ SIZE = 480.0  # of the drawing, which is square
 _REACH = 190.0  # from the middle to the lowest place of the hemisphere
 _LARGEST_ARROW = 30.0  # of the overlay, whose frame is 100 wide
 _METRES_FOR_LARGEST = 0.25
-_KINDS = (hand_view.KIND.name, hand_board.KIND.name)  # both give the same answer
+_KINDS = (HAND_VIEW.name, HAND_BOARD.name)  # both give the same answer
 _TOLD = ("images_used", "hemisphere_coverage", "coverage", "predicted_target_error_mm", "specimen_coverage")
 
 SpotState = Literal["done", "open", "next"]
@@ -93,11 +94,11 @@ def held_now(log: RunRecord, step: Step) -> HandheldView:
         j
         for j in state.jobs.values()
         if j.status == "failed"
-        and (j.kind == coverage_points.KIND.name or (j.kind in _KINDS and j.enqueued_seq == newest))
+        and (j.kind == COVERAGE_POINTS.name or (j.kind in _KINDS and j.enqueued_seq == newest))
     ]
     running = log.state.current == step.id and state.phase == "running" and not log.state.paused
     captures = [c for c in captures_of(log, step.id) if c.replaced is None and isinstance(c.payload, ViewHeld)]
-    answer = None if last is None else hand_view.KIND.read_answer(last.result)
+    answer = None if last is None else HAND_VIEW.read_answer(last.result)
     target = None if answer is None else answer.target
     here = None if answer is None else answer.T_level_camera
     places = () if answer is None else answer.places
@@ -132,13 +133,13 @@ def _overlay(here: Matrix, there: Matrix) -> Overlay:
     return Overlay((round(reach * x, 1), round(reach * y, 1)), z)
 
 
-def _lowest(places: Sequence[hand_view.PlaceStatus]) -> float:
+def _lowest(places: Sequence[PlaceStatus]) -> float:
     """Return the largest distance of a place from the vertical through the middle, metres."""
     radii = [math.hypot(p.T_level_camera[0][3], p.T_level_camera[1][3]) for p in places]
     return max([0.05, *radii])
 
 
-def _spots(places: Sequence[hand_view.PlaceStatus], target: str) -> tuple[PlanMarker, ...]:
+def _spots(places: Sequence[PlaceStatus], target: str) -> tuple[PlanMarker, ...]:
     lowest = _lowest(places)
     return tuple(
         _spot(
@@ -173,7 +174,7 @@ def _seen(viewpoint: str, sha256: str, job: JobState | None) -> JudgedImage:
         parts.append(f"{100 * m['clipped_fraction']:.1f} % clipped")
     if "corners" in m:
         parts.append(f"{m['corners']:.0f} corners")
-    answer = hand_view.KIND.read_answer(job.result)
+    answer = HAND_VIEW.read_answer(job.result)
     return JudgedImage(viewpoint, sha256, "used" if answer.used else "not_used", answer.why, ", ".join(parts))
 
 

@@ -9,8 +9,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.computations import board_view, calibrate, further_view, live_view
-from service.computations.calibrate.records import Intrinsics
+from service.computations.calibration import BOARD_VIEW, CALIBRATE, CalibrateAnswer, Intrinsics
+from service.computations.further_cameras import FURTHER_VIEW
+from service.computations.live import LIVE_VIEW
 from service.computations.records import image_of
 from service.core.protocol import Step
 from service.core.records.events import Event
@@ -144,7 +145,7 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
     """Return the newest job that looked at each photograph of any camera, by SHA-256, finished or not."""
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
-        if job.kind in (live_view.KIND.name, further_view.KIND.name):
+        if job.kind in (LIVE_VIEW.name, FURTHER_VIEW.name):
             found[image_of(job).sha256] = job
     return found
 
@@ -195,15 +196,15 @@ def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str
     return {sha256: board_use(state, view) for sha256, view in images.items()}
 
 
-def calibration_in(state: StepState) -> calibrate.Answer | None:
+def calibration_in(state: StepState) -> CalibrateAnswer | None:
     """Return a step's calibration; None if it has no result yet, or one of another kind, as imported images do."""
-    return calibrate.KIND.read_answer(state.result) if "camera" in state.result else None
+    return CALIBRATE.read_answer(state.result) if "camera" in state.result else None
 
 
 def board_use(state: StepState, view: RecordedView) -> BoardUse:
     """Return whether one image of a step is used, and why."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
-    looks = [job for job in state.jobs.values() if job.kind == board_view.KIND.name]
+    looks = [job for job in state.jobs.values() if job.kind == BOARD_VIEW.name]
     look = next((job for job in looks if image_of(job).sha256 == sha256), None)
     answer = calibration_in(state)
     intrinsics = Intrinsics() if answer is None else answer.details.intrinsics or Intrinsics()
@@ -213,7 +214,7 @@ def board_use(state: StepState, view: RecordedView) -> BoardUse:
         return BoardUse(True, "Used", why.get(name, ""))
     found = None
     if look is not None and look.status == "finished":
-        found = board_view.KIND.read_answer(look.result)
+        found = BOARD_VIEW.read_answer(look.result)
     unseen = found is not None and not found.seen
     departs = [key for key, passed in view.verdicts.items() if not passed]
     reason = why.get(name) or (_plain(found.reason) if found is not None and not found.seen else "")
@@ -230,7 +231,7 @@ def board_use(state: StepState, view: RecordedView) -> BoardUse:
     return BoardUse(None, "Being examined" if look is not None else "Not examined yet")
 
 
-def _hand_eye_images(answer: calibrate.Answer | None) -> set[str]:
+def _hand_eye_images(answer: CalibrateAnswer | None) -> set[str]:
     """Return the images that a hand-eye calibration used; one that has a step of its own takes images of its own."""
     if answer is None or answer.hand_eye is None:
         return set()
@@ -243,7 +244,7 @@ def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
     return sum(use.used is False for use in board_uses(run, events, step).values())
 
 
-def _reasons(state: StepState, answer: calibrate.Answer | None) -> dict[str, str]:
+def _reasons(state: StepState, answer: CalibrateAnswer | None) -> dict[str, str]:
     """Return reasons against using an image, by viewpoint."""
     why: dict[str, str] = {}
     if answer is not None:

@@ -11,9 +11,11 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
-from service.computations import further_view, live_view, locate_spheres
+from service.computations.further_cameras import FURTHER_VIEW
+from service.computations.live import LIVE_VIEW
 from service.computations.records import Matrix, SpheresFound
-from service.computations.register import Registration
+from service.computations.registration import Registration
+from service.computations.scans import LOCATE_SPHERES
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline, outline_from_record
 from service.compute.poses.pose_files import read_camera_json
@@ -86,7 +88,7 @@ def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
 def _found_in(log: RunRecord, step: str) -> SpheresFound:
     """Return the spheres that an import of a scan or a CT found; none without such a step, or before its result."""
     result = log.state.steps[step].result if step in log.state.steps else {}
-    return locate_spheres.KIND.read_answer(result) if result else SpheresFound(spheres_m=())
+    return LOCATE_SPHERES.read_answer(result) if result else SpheresFound(spheres_m=())
 
 
 def _numbered(found: SpheresFound, kind: SphereKind) -> tuple[Sphere, ...]:
@@ -181,7 +183,7 @@ def outlines_of(log: RunRecord, capture: Capture, device: str = "") -> OutlineSo
     job = capture.live
     if job is None or job.status != "finished" or not job.artefacts:
         return None
-    arguments = live_view.KIND.read_arguments(job.arguments, jobs_of(log.state))
+    arguments = LIVE_VIEW.read_arguments(job.arguments, jobs_of(log.state))
     camera = CameraModel.from_record(arguments.camera.plain())
     sha256 = job.artefacts[0].sha256
     return OutlineSource(f"live-{sha256[:16]}", sha256, ct_spheres(log), camera, camera, None, True)
@@ -201,7 +203,7 @@ def _of_further(log: RunRecord, capture: Capture, device: str) -> OutlineSource 
     if mine is None or mine.live is None or mine.live.status != "finished":
         return None
     sha256 = mine.live.artefacts[0].sha256
-    answer = further_view.KIND.read_answer(mine.live.result)
+    answer = FURTHER_VIEW.read_answer(mine.live.result)
     camera = read_camera_json(log.store.artefact_path(mine.exposure.calibration.sha256))
     placed = None if answer.T_ct_camera is None else inverse(np.array(answer.T_ct_camera))
     return OutlineSource(f"live-{sha256[:16]}", sha256, ct_spheres(log), camera, camera, placed, live=False)

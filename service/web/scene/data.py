@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.computations import further_view, fuse
+from service.computations import fuse
+from service.computations.further_cameras import FURTHER_VIEW
 from service.computations.records import Point
-from service.computations.register import Registration
+from service.computations.registration import Registration
 from service.compute.registration.accuracy import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.base import ArtefactRef
@@ -190,7 +191,7 @@ def _live_further(log: RunRecord) -> dict[str, dict[str, Transform]]:
             for one in further_of(log, capture) if capture.replaced is None else ():
                 answer = None
                 if one.live is not None and one.live.status == "finished":
-                    answer = further_view.KIND.read_answer(one.live.result)
+                    answer = FURTHER_VIEW.read_answer(one.live.result)
                 if answer is not None and answer.T_ct_camera is not None:
                     name, fixed = one.exposure.device, one.exposure.mounted == "fixed"
                     view = name if fixed else f"{capture.payload.viewpoint}, {name}"

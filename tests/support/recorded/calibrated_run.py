@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.computations.calibrate.compute import calibrate_camera
+from service.computations.calibration.compute import calibrate_camera
 from service.computations.conversion import hand_eye_record
 from service.compute.calibration.board import BoardView
 from service.compute.calibration.board_search import UsableViews

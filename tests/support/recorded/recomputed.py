@@ -9,8 +9,8 @@ from typing import Any
 
 from service.audit.record.run import RecordedRun
 from service.audit.replay.recomputed import ScratchStore
-from service.computations import register
 from service.computations.job import JobAnswer, JobContext, RecordedContext
+from service.computations.registration import REGISTER
 from service.core.jobs import jobs_of, resolve
 from service.core.run.state import JobState
 from service.worker.loop import HANDLERS
@@ -20,7 +20,7 @@ ARM = ("robot", "robot_corrected")
 
 def arm_jobs(run: RecordedRun) -> dict[str, JobState]:
     """The job of each registration of an arm's poses at full size."""
-    jobs = [job for job in jobs_of(run.state).values() if job.kind == register.KIND.name]
+    jobs = [job for job in jobs_of(run.state).values() if job.kind == REGISTER.name]
     return {
         job.arguments["poses"]: job
         for job in jobs

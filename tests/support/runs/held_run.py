@@ -123,7 +123,7 @@ def held_run(
             bench.store.finish_job(job, measures={}, duration_s=0.1, result=known[job.kind])
         compute_jobs(bench.store)
 
-    monkeypatch.setattr("service.computations.hand_view.compute.look_at_image", look)
+    monkeypatch.setattr("service.computations.hand_held.compute.look_at_image", look)
     bench.operator.on_show = serve
     return bench, person
 

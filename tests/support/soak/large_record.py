@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.computations import live_view
+from service.computations.live import LiveViewAnswer, LiveViewArguments
 from service.computations.records import Camera, Limits, PosedPhotograph
 from service.core.protocol import parse_protocol
 from service.core.records.run_events import ViewpointCaptured
@@ -147,15 +147,15 @@ class LargeRecord:
         store.finish_job(
             job,
             measures={"spheres_seen": 10.0, "edge_width_px": 2.5, "outline_rms_px": 0.2, "clipped_fraction": 0.0},
-            result=live_view.Answer(viewpoint=name, station=_STATION).plain(),
+            result=LiveViewAnswer(viewpoint=name, station=_STATION).plain(),
             duration_s=0.1,
             artefacts=[NewArtefact(answer, "worker", step, 1, name)],
         )
 
 
-def _arguments(viewpoint: str, sha256: str) -> live_view.Arguments:
+def _arguments(viewpoint: str, sha256: str) -> LiveViewArguments:
     """Of a job that nobody computes: as many numbers as a real one has."""
-    return live_view.Arguments(
+    return LiveViewArguments(
         camera=Camera(width=960, height=640, fx=1400.0, fy=1400.0, cx=480.0, cy=320.0, k1=-0.06, k2=0.02),
         T_flange_camera=tuple(map(tuple, np.eye(4).tolist())),
         hand_eye_covariance=tuple(map(tuple, (1e-8 * np.eye(6)).tolist())),
