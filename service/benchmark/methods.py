@@ -213,7 +213,7 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
 
 def triangulation(place: Workplace, dense: Path) -> Command:
     """Return our command that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
-    return (place.python, "-m", "service.benchmark.programs.colmap", "triangulate", str(place.data), str(dense))
+    return (place.python, "-m", "service.benchmark.programs", "triangulate", str(place.data), str(dense))
 
 
 def _colmap_commands(place: Workplace) -> tuple[Command, ...]:
@@ -240,7 +240,9 @@ def _colmap_lacking() -> str:
 
 def _gsplat_commands(place: Workplace) -> tuple[Command, ...]:
     """A process of its own alone loads torch; depth maps are fused as those of the stereo method are."""
-    return ((place.python, "-m", "service.benchmark.programs.gaussians", str(place.data), str(place.work / _MESH)),)
+    return (
+        (place.python, "-m", "service.benchmark.programs", "gaussians", str(place.data), str(place.work / _MESH)),
+    )
 
 
 def _gsplat_lacking() -> str:
@@ -294,7 +296,7 @@ def _pycolmap_commands(place: Workplace) -> tuple[Command, ...]:
     dense, fused, mesh = (str(place.work / name) for name in (_DENSE, _FUSED, _MESH))
     return (
         triangulation(place, place.work / _DENSE),
-        (place.python, "-m", "service.benchmark.programs.colmap", "patch_match", dense, fused, mesh),
+        (place.python, "-m", "service.benchmark.programs", "patch_match", dense, fused, mesh),
     )
 
 
@@ -305,7 +307,7 @@ def _pycolmap_lacking() -> str:
 
 def _stereo_commands(place: Workplace) -> tuple[Command, ...]:
     """A process of its own, so that its time and memory are measured as those of the others."""
-    return ((place.python, "-m", "service.benchmark.programs.stereo", str(place.data), str(place.work / _MESH)),)
+    return ((place.python, "-m", "service.benchmark.programs", "stereo", str(place.data), str(place.work / _MESH)),)
 
 
 def _sugar_commands(place: Workplace) -> tuple[Command, ...]:

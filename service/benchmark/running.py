@@ -19,8 +19,8 @@ import psutil
 import trimesh
 
 from drivers.meshes.surface_file import read_surface_file
+from service.benchmark import measured
 from service.benchmark.methods import Command, Method, Workplace, missing, place_of
-from service.benchmark.programs import measured
 from service.computations.benchmark import RESULT, BenchmarkResult, ComputingEffort, Machine, Scenario, Score
 from service.compute.surfaces.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.surfaces.fuse import compact
@@ -171,7 +171,7 @@ def run_commands(
 
 
 def _measured(command: Command, work: Path, log: Path, environment: Mapping[str, str]) -> dict[str, Any]:
-    """Run a command, and return its status and what it took, as `programs/measured.py` says it."""
+    """Run a command, and return its status and what it took, as `measured.py` says it."""
     reading, writing = os.pipe()
     with log.open("ab") as output, os.fdopen(reading, "rb") as said:
         output.write(f"$ {shlex.join(command)}\n".encode())

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.methods import methods, missing
-from service.benchmark.programs.colmap import reconstruct, triangulate
+from service.benchmark.programs import patch_match, triangulate
 from service.compute.images.render import RayMesh
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
@@ -67,7 +67,7 @@ def test_the_depth_maps_are_fused_and_meshed_in_the_frame_of_the_poses(
     monkeypatch.setattr(pycolmap, "patch_match_stereo", write_true_maps)
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim = 8, 5.0  # there are 16,000 points
-    reconstruct(dense, tmp_path / "fused.ply", tmp_path / "mesh.ply", options)
+    patch_match(dense, tmp_path / "fused.ply", tmp_path / "mesh.ply", options)
     heights = np.array(sorted({slab.z for slab in slab_scene()}))
     for name, most_m in (("fused.ply", 0.2e-3), ("mesh.ply", 1e-3)):
         vertices = read_surface_file(tmp_path / name, "m").vertices_m
@@ -81,7 +81,7 @@ def test_depth_maps_without_depth_end_with_words(
 ) -> None:
     monkeypatch.setattr(pycolmap, "patch_match_stereo", write_empty_maps)
     with pytest.raises(ComputeError, match="no point"):
-        reconstruct(dense, tmp_path / "fused.ply", tmp_path / "mesh.ply")
+        patch_match(dense, tmp_path / "fused.ply", tmp_path / "mesh.ply")
 
 
 def test_the_locked_build_has_no_cuda_and_the_method_says_so() -> None:

@@ -29,7 +29,7 @@ from tests.support.scenes.posed import posed_data_set, scene
 
 COARSE = ChamferSettings(spacing_m=1e-3)
 PLACE = Workplace(Path("/d"), Path("/w"), Path("/c"), "python")
-TRIANGULATED = "python -m service.benchmark.programs.colmap triangulate /d /w/dense"
+TRIANGULATED = "python -m service.benchmark.programs triangulate /d /w/dense"
 COMMANDS = {
     "colmap": [
         TRIANGULATED,
@@ -41,7 +41,7 @@ COMMANDS = {
     ],
     "pycolmap": [
         TRIANGULATED,
-        "python -m service.benchmark.programs.colmap patch_match /w/dense /w/fused.ply /w/mesh.ply",
+        "python -m service.benchmark.programs patch_match /w/dense /w/fused.ply /w/mesh.ply",
     ],
     "openmvs": [
         TRIANGULATED,
@@ -61,8 +61,8 @@ COMMANDS = {
         "python /c/gaussian_splatting/train.py -s /d -m /w/gaussians --iterations 7000",
         "python /c/train.py -s /d -c /w/gaussians -i 7000 -r density -o /w/sugar --eval False",
     ],
-    "stereo": ["python -m service.benchmark.programs.stereo /d /w/mesh.ply"],
-    "gsplat": ["python -m service.benchmark.programs.gaussians /d /w/mesh.ply"],
+    "stereo": ["python -m service.benchmark.programs stereo /d /w/mesh.ply"],
+    "gsplat": ["python -m service.benchmark.programs gaussians /d /w/mesh.ply"],
 }
 STAND_INS = ("colmap", "openmvs", "instant-ngp", "neus2", "sugar")
 PROGRAMS = ("colmap", "InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh")

@@ -27,7 +27,7 @@ SERVICE = {
     # how long something took, for a report; nothing is decided by it
     "service/audit/replay/replay.py": "measures how long a job took",
     "service/audit/verify/verifications.py": "measures how long a verification took",
-    "service/benchmark/programs/measured.py": "measures how long a program took",
+    "service/benchmark/measured.py": "measures how long a program took",
     "service/cli/audit.py": "measures how long a verification took, and says when it was",
     "service/cli/demo.py": "measures how long the demonstration took",
     "service/compute/matching/scores.py": "measures how long a pair of images took",
