@@ -310,7 +310,7 @@ class StepFields(Record):
     title: Text  # the title that people read
     why: str = ""  # the reason, for the technician
     instructions: str = ""  # the technician's work, as text
-    # In service/web/run/drawings, shown beside the instructions; "": that of the step kind. A checklist with `camera`
+    # In service/web/drawings, shown beside the instructions; "": that of the step kind. A checklist with `camera`
     # offers the live view, because the lens is focused there.
     drawing: str = ""
     checklist: tuple[Text, ...] = ()  # items to tick before the step can be confirmed

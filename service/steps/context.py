@@ -501,7 +501,7 @@ class StepKind(Generic[P]):
             this step itself.
         words: returns what a person reads before confirming it.
         drawing: the drawing beside the instructions if the protocol names no other: the name of one in
-            service/web/run/drawings, or, for a kind of a plug-in, an SVG itself (`<svg …`).
+            service/web/drawings, or, for a kind of a plug-in, an SVG itself (`<svg …`).
     """
 
     name: str

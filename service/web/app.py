@@ -46,7 +46,6 @@ _ROUTERS: tuple[APIRouter, ...] = (
 _PAGES = APIRouter(dependencies=[Depends(sealed, scope="function")])
 for _router in _ROUTERS:
     _PAGES.include_router(_router)
-_WITH_STATIC_FILES = ("audit", "calibration", "capture", "dataset", "handheld", "home", "people", "run", "scene")
 
 
 def create_app(site: Site) -> FastAPI:
@@ -63,8 +62,5 @@ def create_app(site: Site) -> FastAPI:
     app.add_middleware(Shield, hosts=site.hosts)
     install_errors(app)
     monitoring.install_metrics(app)
-    for folder in _WITH_STATIC_FILES:
-        files = StaticFiles(packages=[(f"service.web.{folder}", "static")])
-        app.mount(f"/static/{folder}", files, name=f"static_{folder}")
-    app.mount("/static", StaticFiles(packages=[("service.web.page", "static")]), name="static")  # used by every page
+    app.mount("/static", StaticFiles(packages=[("service.web", "static")]), name="static")
     return app

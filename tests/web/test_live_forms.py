@@ -72,12 +72,12 @@ def test_a_form_of_a_capture_by_hand_about_something_else_is_refused(web: WebSit
 
 def test_the_walk_meets_every_form_of_every_part(tmp_path: Path) -> None:
     """A form that no state of the walk shows would not be judged."""
-    templates = Path("service/web")
+    templates = Path("service/web/templates")
     live = [
-        *templates.glob("run/templates/parts/*.j2"),
-        *templates.glob("*/templates/macros.html.j2"),
-        templates / "run/templates/notes.html.j2",
-        templates / "page/templates/banner.html.j2",
+        *templates.glob("run/parts/*.j2"),
+        *templates.glob("*/macros.html.j2"),
+        templates / "run/notes.html.j2",
+        templates / "page/banner.html.j2",
     ]
     written = {
         re.sub(r"^/runs/{{ *[\w.]+ *}}/", "", action)

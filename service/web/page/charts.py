@@ -1,4 +1,4 @@
-"""Small charts as coordinates for SVG, which page/templates/charts.html.j2 draws in the theme's ink."""
+"""Small charts as coordinates for SVG, which templates/page/charts.html.j2 draws in the theme's ink."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from fastapi import FastAPI, Path, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
-from jinja2 import Environment, PackageLoader, PrefixLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
@@ -34,22 +34,9 @@ if TYPE_CHECKING:
 
     from service.audit.record.rows import EventRow
 
-_FOLDERS = (
-    "audit",
-    "calibration",
-    "capture",
-    "dataset",
-    "handheld",
-    "home",
-    "page",
-    "people",
-    "run",
-    "scene",
-)
-
-# Templates lie beside their pages: "run/run.html.j2" is service/web/run/templates/run.html.j2.
+# "run/run.html.j2" is service/web/templates/run/run.html.j2.
 TEMPLATES = Environment(
-    loader=PrefixLoader({folder: PackageLoader(f"service.web.{folder}") for folder in _FOLDERS}),
+    loader=PackageLoader("service.web"),
     autoescape=select_autoescape(["html", "j2"]),
     undefined=StrictUndefined,
     trim_blocks=True,
@@ -90,7 +77,7 @@ def render(
 
     Args:
         request: the request; its `person` is who is signed in, or None on the few public pages.
-        template: the template's path; `run/run.html.j2` is service/web/run/templates/run.html.j2.
+        template: the template's path; `run/run.html.j2` is service/web/templates/run/run.html.j2.
         shown: record of what the page shows; the template has its fields as variables.
         status: the status of the response.
         more: further variables of the template.

@@ -170,7 +170,7 @@ def _ages(site: Site, run_id: str) -> list[str]:
 
 Name = Annotated[str, Query(max_length=64)]
 Parts = Annotated[str, part_names("banner", "control", "vitals", "step", "actions", "dialogs", "side")]
-_DRAWINGS = files("service.web.run") / "drawings"
+_DRAWINGS = files("service.web") / "drawings"
 
 
 @dataclass(frozen=True, slots=True)
