@@ -6,40 +6,40 @@ from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
 from service.people.credentials import failed_tries
-from service.web import monitoring
-from service.web.audit import evidence, exports, overview
-from service.web.audit import pages as audit
-from service.web.calibration import pages as calibration
-from service.web.capture import media
-from service.web.capture import pages as capture
-from service.web.dataset import pages as dataset
-from service.web.handheld import pages as handheld
-from service.web.home import history
-from service.web.home import pages as home
-from service.web.page.rendering import install_errors
-from service.web.people import account
-from service.web.run import actions
-from service.web.run import pages as run
-from service.web.scene import pages as scene
+from service.web import (
+    accounts,
+    audit,
+    audit_exports,
+    audit_overview,
+    calibration,
+    capture,
+    dataset,
+    handheld,
+    home,
+    media,
+    monitoring,
+    run,
+    run_actions,
+    scene,
+)
+from service.web.rendering import install_errors
 from service.web.security import TRIES_WINDOW_S, Limiter, Shield, sealed
 from service.web.site import Site
 
 _ROUTERS: tuple[APIRouter, ...] = (
-    account.router,
+    accounts.router,
     home.router,
-    history.router,
     run.router,
-    actions.router,
+    run_actions.router,
     capture.router,
     handheld.router,
     media.router,
     scene.router,
     calibration.router,
     dataset.router,
-    overview.router,
+    audit_overview.router,
     audit.router,
-    evidence.router,
-    exports.router,
+    audit_exports.router,
     monitoring.router,
 )
 # Put together once: FastAPI works out what a route depends on anew for every application that includes its router.

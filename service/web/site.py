@@ -1,4 +1,4 @@
-"""What every page works on: the data folder, the rig, the people, and the runners that are started from here."""
+"""Holds what every page works on: data folder, rig, people, runners started from here, the level of the spool."""
 
 from __future__ import annotations
 
@@ -9,22 +9,26 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
 from fastapi import Path as UrlPath
 
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.run.expected import EarlierTimes
 from service.followed_run import RunFollower, RunRecord
 from service.monitor.snapshot import Snapshot, log_path, write_snapshot
 from service.people.sessions import People
 from service.rig import Rig, RigDevice
 from service.run_start import recorded_run, require_rig_free, second_place
+from service.store.data_folder import SITE_FILE
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 from service.web.connections import OpenStreams
+
+if TYPE_CHECKING:
+    from service.store.objects.spool import SpoolLevel
 
 
 @dataclass
@@ -159,3 +163,28 @@ def _site(request: Request) -> Site:
 
 CurrentSite = Annotated[Site, Depends(_site)]
 RunId = Annotated[str, UrlPath(max_length=64)]
+
+
+def spool_of(site: Site) -> SpoolLevel | None:
+    """Return how full the spool is; None for a site without an object store, or whose site.yaml is wrong."""
+    try:
+        return _level(site)
+    except OrthocaptureError:
+        return None  # the page of the runs says what is wrong
+
+
+def spool_sentence(site: Site) -> str:
+    """Return how full the spool is, and what hinders it, as a sentence; "" for a site without an object store."""
+    try:
+        level = _level(site)
+    except OrthocaptureError as error:
+        return f"nothing is uploaded: {error}"
+    return "" if level is None else level.sentence
+
+
+def _level(site: Site) -> SpoolLevel | None:
+    if not (site.data / SITE_FILE).is_file():
+        return None
+    from service.store.objects.spool import spool_level  # noqa: PLC0415 - for sites only
+
+    return spool_level(site.store)

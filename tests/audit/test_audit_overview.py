@@ -18,7 +18,7 @@ from service.core.words import local_time
 from service.steps import step_kinds
 from service.store.records import NewArtefact
 from service.store.store import Store
-from service.web.page.run_frame import sentence
+from service.web.run_frame import sentence
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until

@@ -13,7 +13,7 @@ from service.followed_run import RunFollower, read_log
 from service.run_start import recorded_run
 from service.steps.context import Evidence
 from service.store.verification.verify import show
-from service.web.capture.view import views_of
+from service.web.capture_view import views_of
 from tests.support.record.counting import lines_of
 from tests.support.soak.large_record import STEP, LargeRecord
 

@@ -19,7 +19,7 @@ from service.cli.main import app
 from service.core.records.run_events import DeviceOpened
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.page.charts import TimePoint, time_chart
+from service.web.charts import TimePoint, time_chart
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run

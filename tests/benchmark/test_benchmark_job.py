@@ -20,7 +20,7 @@ from service.monitor.snapshot import living_workers
 from service.store.durable_effects import SystemClock
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.dataset.pages import benchmark_of
+from service.web.dataset import benchmark_of
 from service.worker.loop import work
 from tests.support.processes.forked import Forked
 from tests.support.processes.method_plugin import AT_RANDOM, ENDLESS, TRUTH

@@ -14,7 +14,7 @@ from service.dataset.scene_view import viewing_frame
 from service.followed_run import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
-from service.web.scene.data import scene_of
+from service.web.scene_data import scene_of
 from tests.support.pages.at_the_table import STANDING
 from tests.support.pages.browser import accessibility_faults, screen, served
 from tests.support.pages.web import password_of, web_site

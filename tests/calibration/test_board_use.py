@@ -17,8 +17,8 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewJob
-from service.web.calibration.view import calibration_of, image_rows
-from service.web.record.images import board_use, board_uses
+from service.web.calibration import calibration_of, image_rows
+from service.web.images import board_use, board_uses
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.record.core import EYE

@@ -22,8 +22,8 @@ from service.dataset.view_covariances import pose_covariance
 from service.followed_run import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.outlines import displayed_registration, scan_spheres
-from service.web.scene.data import scene_of
+from service.web.outlines import displayed_registration, scan_spheres
+from service.web.scene_data import scene_of
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)

@@ -13,7 +13,7 @@ from drivers.photos.photo_file import check_jpeg_complete
 from service.compute.images.photographs import image_size, read_grey
 from service.core.errors import DataError
 from service.core.picture_files import picture_size
-from service.web.record.pictures import reduced_jpeg
+from service.web.images import reduced_jpeg
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (32, 48), dtype=np.uint8)
 

@@ -30,7 +30,7 @@ from service.steps.registration_jobs import recorded_registration_jobs
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.outlines import displayed_registration
+from service.web.outlines import displayed_registration
 from tests.support.record.store import enqueue
 from tests.support.recorded.registration_record import SPHERES, registration_record
 from tests.support.runs.computing_run import compute_jobs

@@ -11,7 +11,7 @@ from service.core.gates import describe
 from service.core.measure_names import MEASURE_NAMES, REGISTRATION_MEASURE_NAMES, measure_name
 from service.core.records.run_events import GateVerdict
 from service.steps import step_kinds
-from service.web.page.run_frame import figure_line, limit
+from service.web.run_frame import figure_line, limit
 
 
 def declared() -> dict[str, str]:

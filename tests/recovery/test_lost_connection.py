@@ -22,7 +22,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState, connected_arms, lost_arms
 from service.monitor.snapshot import Snapshot
 from service.steps.context import ConnectionEnd
-from service.web.page.robot_banner import Banner, LookAt, robot_banner
+from service.web.robot_banner import Banner, LookAt, robot_banner
 from tests.recovery.test_leave_to_move import restart, running
 from tests.support.record.core import Log
 from tests.support.rig.bench_rig import answer

@@ -12,7 +12,7 @@ import pytest
 from service.core.protocol import Protocol
 from service.core.records.run_events import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
 from service.core.run.decide import AskOperator, decide, evaluate_gates
-from service.web.page.run_frame import needs, stopped_words
+from service.web.run_frame import needs, stopped_words
 from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import WebSite, web_site

@@ -15,7 +15,7 @@ from drivers.interfaces import RobotArm, RobotSample, SafetyState
 from service.core.run.state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
-from service.web.page.robot_banner import Banner, robot_banner
+from service.web.robot_banner import Banner, robot_banner
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
 from tests.support.record.stepped_clock import SteppedClock

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from service.web.calibration.boards import board_plan_svg
+from service.web.calibration_boards import board_plan_svg
 
 
 def test_the_drawing_shows_corners_over_the_image_and_the_cameras_places() -> None:

@@ -16,11 +16,10 @@ from service.core.geometry import apply, inverse, look_at
 from service.core.records.run_events import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, scene_json, viewing_frame
 from service.steps.context import StationLayout
-from service.web.calibration.boards import empty_regions
-from service.web.capture.plan_drawing import WIDTH, plan_drawing
-from service.web.capture.view import StepViewpoint
-from service.web.page.charts import LEVELS, dots, heat_map, vector_field
-from service.web.record.planned_poses import StationPlan
+from service.web.calibration_boards import empty_regions
+from service.web.capture_view import WIDTH, StepViewpoint, plan_drawing
+from service.web.charts import LEVELS, dots, heat_map, vector_field
+from service.web.planned_poses import StationPlan
 from tests.support.pages.browsed_run import BrowsedRun, words
 from tests.support.pages.forms import forms_of
 from tests.support.pages.web import web_site

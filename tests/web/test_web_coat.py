@@ -15,7 +15,7 @@ from service.cli.main import app
 from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.web.run import pages
+from service.web import run
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.runs.bench_run import PROTOCOL, Bench
@@ -83,7 +83,7 @@ def test_every_page_of_the_run_counts_down_to_the_limit_of_the_gate(web: WebSite
 
 def test_the_page_is_drawn_anew_as_the_time_goes(web: WebSite, sprayed: Bench) -> None:
     """The news of a run differ when the words of the clock do: each minute, and each ten seconds near the end."""
-    newest = pages.newest
+    newest = run.newest
     sprayed.clock.passed_s += 600.0
     first = newest(web.site, sprayed.run_id)
     sprayed.clock.passed_s += 61.0

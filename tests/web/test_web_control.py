@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.web.run.pages import newest
+from service.web.run import newest
 from tests.support.pages.browsed_run import words
 from tests.support.pages.forms import forms_of
 from tests.support.pages.web import Browser, WebSite, web_site

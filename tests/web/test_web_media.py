@@ -18,7 +18,7 @@ from service.core.picture_files import picture_size
 from service.core.records.run_events import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
-from service.web.record.pictures import DrawnOutline, cached, draw_marks, nearest_width, reduced_jpeg, safe_name
+from service.web.images import DrawnOutline, cached, draw_marks, nearest_width, reduced_jpeg, safe_name
 from tests.support.pages.browsed_run import BrowsedRun
 from tests.support.pages.web import web_site
 from tests.support.record.core import EYE
@@ -106,7 +106,7 @@ def test_pictures_are_made_small_once(shown: RunWithImage, monkeypatch: pytest.M
     first = shown.browser.get(address)
     assert picture_size(first.content) == (160, 107)
     assert "immutable" in first.headers["cache-control"]
-    monkeypatch.setattr("service.web.capture.media.reduced_jpeg", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("service.web.media.reduced_jpeg", lambda *_: pytest.fail("decoded again"))
     assert shown.browser.get(address).content == first.content
     assert not list((shown.site.site.data / "cache").rglob("*.part"))
 

@@ -13,7 +13,7 @@ from service.core.records.run_events import DeviceOpened, DeviceTrouble, FilesKe
 from service.core.recovery import ways_on
 from service.monitor.snapshot import RobotPhase, Snapshot, write_snapshot
 from service.people.person import ROLES, Role, may
-from service.web.page.run_frame import RunStanding, run_standing
+from service.web.run_frame import RunStanding, run_standing
 from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import ShownSite, shown_site
 from tests.support.pages.states import BEGUN

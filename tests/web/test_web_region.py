@@ -21,7 +21,7 @@ from service.core.run.state import JobState
 from service.dataset.scene_view import scene_json, viewing_frame
 from service.followed_run import RunRecord, read_log
 from service.run_start import recorded_run
-from service.web.scene.data import scene_of
+from service.web.scene_data import scene_of
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.runs.recorded_run import FUSION, PROTOCOL, record_run
 

@@ -35,10 +35,10 @@ from service.core.run.fold import fold
 from service.core.words import time_here
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
-from service.web.page.robot_banner import robot_banner
-from service.web.page.run_frame import limit
-from service.web.run.view import run_view
-from service.web.run.view_records import RunView, Viewer, view_intervals_s
+from service.web.robot_banner import robot_banner
+from service.web.run_frame import limit
+from service.web.run_view import run_view
+from service.web.run_view_records import RunView, Viewer, view_intervals_s
 from tests.support.record.core import Log
 
 PROTOCOLS = Path(__file__).parents[2] / "protocols"

@@ -249,7 +249,7 @@ def _work(store: Store, place: Place, parent: int, _person: str) -> None:
 
 
 def _release(store: Store, place: Place, _parent: int, person: str) -> None:
-    """Release the completed run as a second person, as service.web.audit.exports.release does."""
+    """Release the completed run as a second person, as service.web.audit_exports.release does."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     state = fold(protocol, store.events(run_id))

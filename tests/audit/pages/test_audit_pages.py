@@ -12,7 +12,7 @@ from fastapi.routing import APIRoute
 from service.audit.overview import first_page
 from service.people.person import may
 from service.store.verification.verify import verify
-from service.web.audit import evidence, overview, pages
+from service.web import audit, audit_overview
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
 from tests.support.record.outsider import rows, tamper
@@ -73,7 +73,7 @@ def test_first_page_shows_deviations_before_everything_else(web: WebSite, run: s
 
 @pytest.mark.slow
 def test_auditors_change_nothing_but_may_verify(web: WebSite, run: str) -> None:
-    modules = (overview, pages, evidence)
+    modules = (audit_overview, audit, audit)
     routes = [route for page in modules for route in page.router.routes]
     posts = [r for r in routes if isinstance(r, APIRoute) and "POST" in (r.methods or ())]
     assert {route.name for route in posts} == {"correct", "verify"}

@@ -36,7 +36,7 @@ from service.store.database.tables import jobs, leases
 from service.store.disk_space import USUAL_AGE_S, remove_leftovers
 from service.store.durable_effects import moment_of
 from service.store.records import NewJob
-from service.web.capture.media import live_view
+from service.web.media import live_view
 from service.web.site import Site
 from tests.support.clocks.world import Duration, Seen, World, above, allows, below
 from tests.support.record.store import enqueue, put_image, start_run

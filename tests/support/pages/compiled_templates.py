@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jinja2
 
-from service.web.page import rendering
+from service.web import rendering
 
 COMPILED = Path(__file__).parents[3] / "build" / "templates"
 

@@ -16,7 +16,7 @@ from service.core.protocol import parse_protocol
 from service.steps import params_models
 from service.steps.protocol_check import implausible
 from service.store.signatures.signing import checkpoint
-from service.web.audit.frame import AuditState
+from service.web.audit import AuditState
 from service.worker.loop import work
 from tests.support.pages.web import WebSite, web_site
 

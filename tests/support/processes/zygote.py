@@ -43,7 +43,7 @@ OF_PAGES = {
         "service.audit.report.output",
     ),
     "service.audit.verify.verifications": (),
-    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview"),
+    "service.web.preview_process": ("service.audit.record.run", "service.dataset.preview"),
 }
 VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
     "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",
@@ -201,7 +201,7 @@ def _do_once_for_all() -> None:
         sys.modules["service.core.loading"].plug_ins("")  # searches the installed packages
     if "service.core.protocol" in sys.modules and "service.store.events" in sys.modules:
         importlib.import_module("tests.support.processes.first_reading").read_once()
-    if "service.web.page.rendering" in sys.modules:
+    if "service.web.rendering" in sys.modules:
         importlib.import_module("tests.support.pages.compiled_templates").keep_compiled_templates()
 
 

@@ -26,7 +26,7 @@ from service.dataset.preview_records import (
 )
 from service.dataset.run_data_set import data_set_of
 from service.dataset.scene_view import decimated
-from service.web.dataset.pages import Previews
+from service.web.dataset import Previews
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run
 from tests.support.recorded.unpacked_run import unpack_recorded_run

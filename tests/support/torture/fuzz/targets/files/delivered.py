@@ -21,7 +21,7 @@ from service.compute.images.photographs import read_grey, read_image
 from service.compute.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.import_folder import camera_record
 from service.store.events import canonical
-from service.web.record.pictures import reduced_jpeg
+from service.web.images import reduced_jpeg
 from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
@@ -221,7 +221,7 @@ TARGETS: tuple[Target, ...] = (
         _jpegs,
     ),
     Target("image", "service.compute.images.photographs:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
-    Target("web_picture", "service.web.record.pictures:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
+    Target("web_picture", "service.web.images:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
     Target("mesh_ply", "drivers.meshes.mesh_file:read_mesh_file", _mesh("ply"), _plys, (*BYTES, *TEXT)),
     Target("mesh_stl", "drivers.meshes.mesh_file:read_mesh_file", _mesh("stl"), _stls, (*BYTES, *TEXT)),
     Target("mesh_obj", "drivers.meshes.mesh_file:read_mesh_file", _mesh("obj"), lambda _: _scan("obj"), TEXT),

@@ -1,1 +1,0 @@
-"""Live capture by the robot: viewpoints, last image, plan and pictures."""

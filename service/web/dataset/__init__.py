@@ -1,1 +1,0 @@
-"""The data set of a run: its views, depth, coverage, and how its surfaces agree."""

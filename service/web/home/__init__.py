@@ -1,1 +1,0 @@
-"""The first page and what concerns many runs: start, comparison, history, checklists."""

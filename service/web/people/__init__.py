@@ -1,1 +1,0 @@
-"""Accounts, sign-in, roles and badges."""

@@ -1,1 +1,0 @@
-"""What several pages read from a run: its images, spheres, planned poses and board images."""

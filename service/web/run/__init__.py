@@ -1,1 +1,0 @@
-"""The guided screen of a run: its steps, actions, notes and news."""

@@ -1,1 +1,0 @@
-"""The scene of a run in 3D and as tables."""
