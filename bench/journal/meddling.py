@@ -27,7 +27,7 @@ from typing import Any
 from argon2 import PasswordHasher
 
 from bench.machine import RESULTS, commit, machine
-from service.audit.verify.verifications import Verifications, keep_verification, verification_of
+from service.audit.verifications import Verifications, keep_verification, verification_of
 from service.core.errors import OrthocaptureError, StoreError
 from service.people.sessions import People
 from service.store.database.engine import DATABASE_NAME

@@ -23,7 +23,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from bench.machine import RESULTS, commit, machine
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
 from service.cli.main import app
 from service.store.store import Store
 from service.store.verification.verify import verify

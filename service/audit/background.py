@@ -20,7 +20,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 from sqlalchemy import text
 
-from service.audit.record.rows import head
+from service.audit.queries import head
 from service.core.errors import OrthocaptureError
 from service.store.durable_effects import Clock, utc_text
 from service.store.store import Store

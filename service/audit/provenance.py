@@ -11,8 +11,7 @@ from typing import Any
 from sqlalchemy import Connection, bindparam, text
 
 from service.audit.background import IncrementalResults, PartialResult
-from service.audit.record.rows import EventRow, head, plain, plain_payload, read_rows
-from service.audit.record.search import artefacts_of_events, one_artefact
+from service.audit.queries import EventRow, artefacts_of_events, head, one_artefact, plain, plain_payload, read_rows
 from service.computations import job_kinds
 from service.core.jobs import Each, Reference, references_in
 from service.core.records.run_events import FilesKept, JobEnqueued

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from service.audit.verify.verifications import keep_verification, verification_of
+from service.audit.verifications import keep_verification, verification_of
 from service.cli.audit_report import figures_command, report_command
 from service.cli.common import (
     DEFAULT_DATA,
@@ -99,7 +99,7 @@ def correct_command(
     json: JsonOption = False,
 ) -> None:
     """Correct a recorded value. The original stays, and readers see both, with who, when and why."""
-    from service.audit.overview.findings import correct  # noqa: PLC0415 - `verify` does not need the overview
+    from service.audit.findings import correct  # noqa: PLC0415 - `verify` does not need the overview
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
@@ -312,7 +312,7 @@ def export_command(
     It is refused if the evidence does not verify, or if a release that the protocol requires is missing.
     """
     # Imported here because they load the numerics, which `verify` does not need.
-    from service.audit.bundle.export import bundle_report, export_bundle  # noqa: PLC0415
+    from service.audit.bundle import bundle_report, export_bundle  # noqa: PLC0415
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)

@@ -67,9 +67,9 @@ def report_command(
         with progress_bar(quiet=json) as progress:
             verified = audit.verify(data, run_id, progress).with_limits()
             # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
-            from service.audit.record.run import read_run  # noqa: PLC0415
-            from service.audit.report.content import report_content  # noqa: PLC0415
-            from service.audit.report.output import write_html, write_pdf  # noqa: PLC0415
+            from service.audit.recorded_run import read_run  # noqa: PLC0415
+            from service.audit.report import report_content  # noqa: PLC0415
+            from service.audit.report_output import write_html, write_pdf  # noqa: PLC0415
 
             progress("writing the report", 0, 1)
             report = report_content(read_run(data, run_id), verified, with_scene=html is not None)
@@ -116,7 +116,7 @@ def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str
 
 
 def _record(data: Path, run_id: str, head_sha256: str, actor: str, part: Path, file_name: str) -> None:
-    from service.audit.bundle.export import record_export  # noqa: PLC0415  # loads the numerics
+    from service.audit.bundle import record_export  # noqa: PLC0415  # loads the numerics
 
     with Store.open(data, create=False) as store:
         record_export(store, run_id, part, file_name=file_name, what="report", head_sha256=head_sha256, actor=actor)
@@ -150,9 +150,9 @@ def figures_command(
                 error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
                 raise typer.Exit(ExitStatus.FAILED)
             # The numerics take a second to load, and `audit verify` does not need them.
-            from service.audit.record.run import read_run  # noqa: PLC0415
-            from service.audit.report.content import report_content  # noqa: PLC0415
-            from service.audit.report.output import figure_files, write_figures  # noqa: PLC0415
+            from service.audit.recorded_run import read_run  # noqa: PLC0415
+            from service.audit.report import report_content  # noqa: PLC0415
+            from service.audit.report_output import figure_files, write_figures  # noqa: PLC0415
 
             progress("drawing the figures", 0, 1)
             recorded = read_run(data, run_id)

@@ -20,11 +20,11 @@ import typer
 from numpy.typing import ArrayLike
 from rich.table import Table
 
-from service.audit.export.posed import export_data_set
-from service.audit.export.wanted import WantedExport
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import write_html
+from service.audit.data_set_export import export_data_set
+from service.audit.exports import WantedExport
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import write_html
 from service.cli.common import (
     JsonOption,
     console,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 
-from service.audit.export.wanted import WantedExport
+from service.audit.exports import WantedExport
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -109,7 +109,7 @@ def export_command(
     has a data card, Croissant and RO-Crate metadata, and an index of the views.
     """
     with reporting_errors(json), Store.open(data, create=False) as store:
-        from service.audit.export.posed import export_data_set  # noqa: PLC0415 - loads the numerics
+        from service.audit.data_set_export import export_data_set  # noqa: PLC0415 - loads the numerics
 
         target = out.resolve()
         require_writable_folder(target)

@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from service.audit.record.run import read_run
-from service.audit.replay.differences import Difference
-from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, ReplayReport, replay
+from service.audit.differences import Difference
+from service.audit.recorded_run import read_run
+from service.audit.replay import DEFAULT_KINDS, JobReplay, ReplayReport, replay
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,

@@ -10,11 +10,10 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from service.audit.comparison import ComparedRun, RunComparison, compare_runs
 from service.audit.filters import RESULTS, RunSearch
-from service.audit.record.rows import plain
-from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
-from service.audit.runs.history import history, history_csv
-from service.audit.runs.search import RESULT_WORDS, FoundRun, find_runs
+from service.audit.queries import plain
+from service.audit.runs import RESULT_WORDS, FoundRun, find_runs, history, history_csv
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,

@@ -19,7 +19,7 @@ from typing import Annotated
 
 import typer
 
-from service.audit.record.starts import record_start
+from service.audit.starts import record_start
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,

@@ -11,18 +11,15 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Depends, FastAPI, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
+from service.audit import findings, overview, queries
 from service.audit.background import ChildState, IncrementalResults, PartialProgress
+from service.audit.devices import bodies_of_run, clock_offsets, opened_devices, sessions
 from service.audit.filters import ArtefactFilter, EventFilter, RunFilter
-from service.audit.overview import findings, first_page
-from service.audit.overview.devices import bodies_of_run, clock_offsets, opened_devices, sessions
-from service.audit.overview.digest import Digest, digests
-from service.audit.overview.findings import correct, correctable
-from service.audit.overview.first_page import verified
-from service.audit.overview.signatures import signatures
+from service.audit.findings import correct, correctable, signatures
+from service.audit.overview import Digest, digests, verified
 from service.audit.provenance import Graph, draw, graphs, origin
-from service.audit.record import rows, search
-from service.audit.record.rows import RunBasics
-from service.audit.verify.verifications import Verification, Verifications
+from service.audit.queries import RunBasics
+from service.audit.verifications import Verification, Verifications
 from service.computations import term
 from service.core.measure_names import measure_name
 from service.core.protocol import Protocol, Step
@@ -107,7 +104,7 @@ class AuditFrame:
 def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
     """Return the frame of one run's page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
-        found = rows.runs(connection, run_id)
+        found = queries.runs(connection, run_id)
     if not found:
         raise UnknownRunError(f"there is no run {run_id!r}", remedy="Choose one from the list of runs")
     base = f"/audit/runs/{run_id}"
@@ -189,7 +186,7 @@ class AccuracyRow:
 def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     """Show every gate of every step, in the order of the protocol."""
     digest = audit.digests.get(run_id)
-    known = first_page.known(digest)
+    known = overview.known(digest)
     return render(
         request,
         "audit/gates.html.j2",
@@ -268,7 +265,7 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
         opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         started = findings.events_of(connection, run_id, "session_started", newest=True)
         troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
-        trouble_count = rows.count_of_kind(connection, run_id, "device_trouble")
+        trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
         clocks = clock_offsets(connection, run_id)
         bodies = bodies_of_run(connection, run_id, opened)
     log = audit.site.run(run_id)
@@ -300,18 +297,18 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
     """Show old and new: corrected values, steps done again, views taken again."""
     frame = audit_frame(audit, run_id, "/corrections")
     digest = audit.digests.get(run_id)
-    known = first_page.known(digest)
+    known = overview.known(digest)
     views = findings.replaced_viewpoints(known) if known else []
-    pages = max(1, -(-len(views) // rows.PAGE))
+    pages = max(1, -(-len(views) // queries.PAGE))
     page = min(max(page, 1), pages)
-    shown = views[(page - 1) * rows.PAGE : page * rows.PAGE]
+    shown = views[(page - 1) * queries.PAGE : page * queries.PAGE]
     with audit.site.store.database.reading() as connection:
         values = findings.corrected_values(connection, run_id)
         steps = findings.replaced_steps(connection, run_id, known) if known else []
         seqs = sorted({seq for view in shown for seq in (view.old_seq, view.new_seq) if seq})
-        files = search.artefacts_of_events(connection, run_id, seqs)
+        files = queries.artefacts_of_events(connection, run_id, seqs)
         pictures = {file.seq: file for file in reversed(files) if file.ref.is_picture}
-        corrected = rows.count_of_kind(connection, run_id, "record_corrected")
+        corrected = queries.count_of_kind(connection, run_id, "record_corrected")
     return render(
         request,
         "audit/corrections.html.j2",
@@ -353,7 +350,7 @@ def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
     """Show who signed what, and whether the signature is still valid."""
     frame = audit_frame(audit, run_id, "/signatures")
     digest = audit.digests.get(run_id)
-    known = first_page.known(digest)
+    known = overview.known(digest)
     with audit.site.store.database.reading() as connection:
         found = signatures(connection, run_id, known)
     return render(
@@ -407,13 +404,13 @@ def _events(
 ) -> Response:
     digest = here.digests.get(chain) if chain != SITE else None
     with here.site.store.database.reading() as connection:
-        facets = digest.facets if digest is not None and not isinstance(digest, PartialProgress) else search.Facets()
-        last, _ = rows.head(connection, chain)
+        facets = digest.facets if digest is not None and not isinstance(digest, PartialProgress) else queries.Facets()
+        last, _ = queries.head(connection, chain)
         if chain == SITE:
             facets.add(connection, SITE, 0, last)
         counted = facets.matching(query) if facets.kinds else None
-        page = search.events_page(connection, chain, query, after=query.after, before=query.before, counted=counted)
-        devices = search.artefact_facets(connection, chain)["device"]
+        page = queries.events_page(connection, chain, query, after=query.after, before=query.before, counted=counted)
+        devices = queries.artefact_facets(connection, chain)["device"]
     address = request.url.path
     return render(
         request,
@@ -441,15 +438,15 @@ def _event(
     request: Request, here: AuditState, chain: str, seq: int, *, may_correct: bool, **context: Any
 ) -> Response:
     with here.site.store.database.reading() as connection:
-        row = rows.one_event(connection, chain, seq)
-        last, _ = rows.head(connection, chain)
-        brought = search.artefacts_of_events(connection, chain, [row.seq])
+        row = queries.one_event(connection, chain, seq)
+        last, _ = queries.head(connection, chain)
+        brought = queries.artefacts_of_events(connection, chain, [row.seq])
     return render(
         request,
         "audit/event.html.j2",
         event=row,
         last=last,
-        computed_sha256=rows.computed_sha256(chain, row),
+        computed_sha256=queries.computed_sha256(chain, row),
         brought=brought,
         fields=correctable(row.payload) if may_correct and row.kind != "record_corrected" else [],
         events_at=f"/audit/runs/{chain}/events" if chain != SITE else "/audit/site/events",
@@ -487,8 +484,8 @@ def artefacts_page(
     """Show every file of a run."""
     frame = audit_frame(audit, run_id, "/artefacts")
     with audit.site.store.database.reading() as connection:
-        found = search.artefacts_page(connection, run_id, query, page=query.page)
-        facets = search.artefact_facets(connection, run_id)
+        found = queries.artefacts_page(connection, run_id, query, page=query.page)
+        facets = queries.artefact_facets(connection, run_id)
     return render(
         request,
         "audit/artefacts.html.j2",

@@ -10,8 +10,7 @@ from fastapi import APIRouter, Depends, Form, Path, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
 from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
-from service.audit.export.exports import Exports, Formats, What, zip_chunks
-from service.audit.export.wanted import WantedExport
+from service.audit.exports import Exports, Formats, WantedExport, What, zip_chunks
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates import refuse_data_set, refuse_export, refuse_release, release_meaning
 from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement

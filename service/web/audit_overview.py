@@ -11,17 +11,24 @@ from fastapi import APIRouter, Depends, FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, Response
 from sqlalchemy import text
 
+from service.audit import findings, overview, queries
 from service.audit.background import PartialProgress
+from service.audit.devices import bodies_of_run, opened_devices
 from service.audit.filters import RunSearch
-from service.audit.overview import findings, first_page
-from service.audit.overview.devices import bodies_of_run, opened_devices
-from service.audit.overview.digest import Digest, failed_exposures_of, shots_of, together
-from service.audit.overview.first_page import DEVIATION_GROUPS, GROUPS, NOTE_GROUPS, ListedRun
-from service.audit.overview.signatures import RecordedSignature
-from service.audit.overview.signatures import signatures as signatures_of
-from service.audit.record import rows
-from service.audit.record.rows import EventRow
-from service.audit.runs.search import find_runs
+from service.audit.findings import RecordedSignature
+from service.audit.findings import signatures as signatures_of
+from service.audit.overview import (
+    DEVIATION_GROUPS,
+    GROUPS,
+    NOTE_GROUPS,
+    Digest,
+    ListedRun,
+    failed_exposures_of,
+    shots_of,
+    together,
+)
+from service.audit.queries import EventRow
+from service.audit.runs import find_runs
 from service.core.errors import OrthocaptureError
 from service.core.recorded_devices import CameraBodies, RecordedIdentity
 from service.people.approvals import Approval, approvals, difference
@@ -142,12 +149,12 @@ class _Recorded:
 
 def _recorded(audit: AuditState, run_id: str, digest: Digest | None) -> _Recorded:
     with audit.site.store.database.reading() as connection:
-        root = rows.read_rows(connection, run_id, [1], whole=True)
+        root = queries.read_rows(connection, run_id, [1], whole=True)
         opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         sessions = findings.events_of(connection, run_id, "session_started", newest=True)
         return _Recorded(
             root=root[0] if root else None,
-            corrected=rows.count_of_kind(connection, run_id, "record_corrected"),
+            corrected=queries.count_of_kind(connection, run_id, "record_corrected"),
             devices={device.name: device.report.identity for device in opened},
             session=sessions[-1] if sessions else None,
             sessions=len(sessions),
@@ -163,10 +170,10 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     """Show the first page of a run: deviations first."""
     frame = audit_frame(audit, run_id, "")
     digest = audit.digests.get(run_id)
-    known = first_page.known(digest)
+    known = overview.known(digest)
     recorded = _recorded(audit, run_id, known)
-    listed = first_page.findings(known) if known else []
-    gates = first_page.failed_gates(known) if known else []
+    listed = overview.findings(known) if known else []
+    gates = overview.failed_gates(known) if known else []
     return render(
         request,
         "audit/run.html.j2",
@@ -175,10 +182,10 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         audit=frame,
         digest=known,
         progress=digest if isinstance(digest, PartialProgress) else None,
-        counts=first_page.counts(known) if known else {},
+        counts=overview.counts(known) if known else {},
         deviation_groups=DEVIATION_GROUPS,
         note_groups=NOTE_GROUPS,
-        group_name=first_page.group_name,
+        group_name=overview.group_name,
         listed=listed[:_FIRST],
         deviations=len(listed),
         failed_gates=gates[:_FIRST],
@@ -211,10 +218,10 @@ def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: s
     """Show all deviations, or what is in one group of them or of what else is recorded."""
     frame = audit_frame(audit, run_id, "")
     digest = audit.digests.get(run_id)
-    known = first_page.known(digest)
+    known = overview.known(digest)
     group = group if group in GROUPS else ""
-    listed = first_page.findings(known, group) if known else []
-    pages = max(1, -(-len(listed) // rows.PAGE))
+    listed = overview.findings(known, group) if known else []
+    pages = max(1, -(-len(listed) // queries.PAGE))
     page = min(max(page, 1), pages)
     return render(
         request,
@@ -224,9 +231,9 @@ def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: s
         groups=GROUPS,
         note_groups=NOTE_GROUPS,
         deviations=len(known.deviations) if known else 0,
-        counts=first_page.counts(known) if known else {},
+        counts=overview.counts(known) if known else {},
         group=group,
-        listed=listed[(page - 1) * rows.PAGE : page * rows.PAGE],
+        listed=listed[(page - 1) * queries.PAGE : page * queries.PAGE],
         count=len(listed),
         page=page,
         pages=pages,
@@ -241,10 +248,10 @@ _RUNS_A_PAGE = 25
 def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, Query()]) -> Response:
     """Show the runs, newest first."""
     with audit.site.store.database.reading() as connection:
-        every = rows.runs(connection)
+        every = queries.runs(connection)
     said = {run.basics.run_id for run in find_runs(audit.site.store, RunSearch(q=query.q))}
     listed = [_listed(audit, basics) for basics in every]
-    found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, query)]
+    found = [run for run in listed if run.basics.run_id in said and overview.matches(run, query)]
     pages = max(1, -(-len(found) // _RUNS_A_PAGE))
     page = min(max(query.page, 1), pages)
     return render(
@@ -255,7 +262,7 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
         every=len(every),
         unknown=sum(run.digest is None for run in found),
         protocols=sorted({run.protocol for run in every if run.protocol}),
-        people=first_page.people_of(listed),
+        people=overview.people_of(listed),
         wanted=query,
         page=page,
         pages=pages,
@@ -263,8 +270,8 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
     )
 
 
-def _listed(audit: AuditState, basics: rows.RunBasics) -> ListedRun:
+def _listed(audit: AuditState, basics: queries.RunBasics) -> ListedRun:
     digest = audit.digests.at(basics.run_id, basics.head_seq, basics.head_sha256)
     if isinstance(digest, PartialProgress):
         audit.digests.warm(basics.run_id)
-    return ListedRun(basics, first_page.known(digest), audit.verifications.last(basics.run_id))
+    return ListedRun(basics, overview.known(digest), audit.verifications.last(basics.run_id))

@@ -11,10 +11,19 @@ from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import Field
 
+from service.audit.comparison import ComparedRun, compare_runs
 from service.audit.filters import RunSearch
-from service.audit.runs.comparison import ComparedRun, compare_runs
-from service.audit.runs.history import FIGURES, Figure, HistoryRow, Instrument, by_instrument, history, history_csv
-from service.audit.runs.search import RESULT_WORDS, find_runs
+from service.audit.runs import (
+    FIGURES,
+    RESULT_WORDS,
+    Figure,
+    HistoryRow,
+    Instrument,
+    by_instrument,
+    find_runs,
+    history,
+    history_csv,
+)
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.measure_names import measure_name
 from service.core.protocol import LoadedProtocol, Protocol, irreversible_warning, load_protocol

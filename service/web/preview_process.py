@@ -14,7 +14,7 @@ from service.machine.resources import compute_in_background
 
 def preview(data: Path, run_id: str, folder: Path, progress: Progress) -> str:
     """Make the preview of a run in a folder. Returns the folder's name. Raises OrthocaptureError."""
-    from service.audit.record.run import read_run  # noqa: PLC0415 - these load the numerics
+    from service.audit.recorded_run import read_run  # noqa: PLC0415 - these load the numerics
     from service.dataset.preview import make_preview  # noqa: PLC0415
 
     progress("reading the run", 0, 0)

@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
-from service.audit.overview.first_page import kind_name
+from service.audit.overview import kind_name
 from service.core.errors import ConfigurationError, DataError, IntegrityError, OrthocaptureError, ProtocolError
 from service.core.records.entered import RunAbout, about_rows
 from service.core.words import counted, local_time
@@ -32,7 +32,7 @@ from service.web.security import add_safety_headers, token_of
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from service.audit.record.rows import EventRow
+    from service.audit.queries import EventRow
 
 # "run/run.html.j2" is service/web/templates/run/run.html.j2.
 TEMPLATES = Environment(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.overview.devices import clock_offsets
+from service.audit.devices import clock_offsets
 from service.cli.main import app
 from service.core.measure_names import measure_name
 from service.core.records.run_events import FilesKept, SessionStarted, StepStarted

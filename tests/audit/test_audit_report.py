@@ -15,12 +15,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import export_bundle
-from service.audit.record.run import read_run
-from service.audit.report.blocks import Report
-from service.audit.report.content import report_content
-from service.audit.report.course import incidents
-from service.audit.report.output import render_html
+from service.audit.bundle import export_bundle
+from service.audit.recorded_run import read_run
+from service.audit.report import incidents, report_content
+from service.audit.report_blocks import Report
+from service.audit.report_output import render_html
 from service.cli.main import app
 from service.core.errors import StoreError
 from service.core.records.events import Event

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.audit.replay.recomputed import CopiedResults
+from service.audit.replay import CopiedResults
 from service.core.run.state import JobState
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import bundle_report, export_bundle
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html
+from service.audit.bundle import bundle_report, export_bundle
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html
 from service.cli.main import app
 from service.core.run.fold import fold
 from service.core.run.state import Deviation

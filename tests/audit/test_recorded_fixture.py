@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from service.audit.filters import EventFilter
-from service.audit.record.run import read_run
-from service.audit.record.search import events_page
-from service.audit.replay.replay import replay
+from service.audit.queries import events_page
+from service.audit.recorded_run import read_run
+from service.audit.replay import replay
 from service.core.records.run_events import JobEnqueued, StepMeasured
 from service.steps.protocol_check import measures_of
 from service.store.store import Store

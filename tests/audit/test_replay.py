@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.record.run import read_run
-from service.audit.replay.differences import compare_data, compare_files
-from service.audit.replay.replay import ReplayReport, replay
+from service.audit.differences import compare_data, compare_files
+from service.audit.recorded_run import read_run
+from service.audit.replay import ReplayReport, replay
 from service.cli.main import app
 from service.computations import job_kinds
 from service.computations.job import Handler, JobAnswer, RecordedContext

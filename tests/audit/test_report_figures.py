@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html
 from service.cli.main import app
 from service.store.verification.verify import verify
 from tests.support.recorded.reported_run import record_reported_run

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from service.audit.record.run import read_run
-from service.audit.report.blocks import Report
-from service.audit.report.content import report_content
-from service.audit.report.output import render_pdf
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_blocks import Report
+from service.audit.report_output import render_pdf
 from service.store.verification.verify import verify
 from tests.support.pages.pdf_text import fonts_of, pages_of, reader_of, root_of, tags_of
 from tests.support.recorded.reported_run import record_reported_run
@@ -41,7 +41,7 @@ def pdf(report: Report) -> bytes:
 @pytest.fixture
 def no_dejavu(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hide DejaVu, as on a machine where it is not installed."""
-    monkeypatch.setattr("service.audit.report.output._FONT_FOLDERS", ())
+    monkeypatch.setattr("service.audit.report_output._FONT_FOLDERS", ())
 
 
 @pytest.mark.slow

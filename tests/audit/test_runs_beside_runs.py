@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from service.audit.runs.history import by_instrument, history
+from service.audit.runs import by_instrument, history
 from service.cli.main import app
 from service.core.records.run_events import DeviceOpened
 from service.store.store import Store

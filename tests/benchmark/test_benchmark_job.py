@@ -12,8 +12,8 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.record.run import read_run
-from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, replay
+from service.audit.recorded_run import read_run
+from service.audit.replay import DEFAULT_KINDS, JobReplay, replay
 from service.cli.main import app
 from service.core.records.run_events import JobEnqueued, JobFailed, JobFinished, RunCompleted
 from service.monitor.snapshot import living_workers

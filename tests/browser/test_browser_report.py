@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import write_html
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import write_html
 from service.store.verification.verify import verify
 from tests.support.recorded.reported_run import record_reported_run
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
 from service.cli.main import app
 from service.cli.terminal_output import Terminal
 from service.core.words import shown

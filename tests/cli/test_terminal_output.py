@@ -12,7 +12,7 @@ import pytest
 import typer
 from rich.markup import escape  # noqa: TID251 - what Typer would take for markup
 
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
 from service.cli import main as command_line
 from service.cli.common import print_document, print_json, reporting_errors
 from service.core.errors import ConfigurationError

@@ -25,8 +25,8 @@ CLOCK = re.compile(r"\bimport (time|datetime)\b|\bfrom (time|datetime) import\b"
 SERVICE = {
     "service/store/durable_effects.py": "the clock of the host, which all others are given",
     # how long something took, for a report; nothing is decided by it
-    "service/audit/replay/replay.py": "measures how long a job took",
-    "service/audit/verify/verifications.py": "measures how long a verification took",
+    "service/audit/replay.py": "measures how long a job took",
+    "service/audit/verifications.py": "measures how long a verification took",
     "service/benchmark/measured.py": "measures how long a program took",
     "service/cli/audit.py": "measures how long a verification took, and says when it was",
     "service/cli/demo.py": "measures how long the demonstration took",
@@ -35,7 +35,7 @@ SERVICE = {
     "service/compute/sfm/front_end.py": "measures how long a reconstruction took",
     "service/web/monitoring.py": "measures how long a page took",
     # the date of a file that is written now
-    "service/audit/report/content.py": "the time of a report that is given none",
+    "service/audit/report.py": "the time of a report that is given none",
     "service/benchmark/running.py": "the time at which a benchmark ended",
     # what waits for another process, on a pipe, a socket or a file, which knows no other clock
     "service/audit/background.py": "a child says no more than its parent reads; and rests, so that pages come first",

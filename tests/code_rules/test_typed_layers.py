@@ -13,9 +13,9 @@ UNTYPED = re.compile(r"\b(dict|Mapping|MutableMapping)\[str, (Any|object)\]")
 # The modules in which JSON, rows of SQL or messages of a child process become records, or records become these.
 EDGES = {
     # recorded events and arguments of jobs, before their records are read and after they are written
-    "service/audit/overview/findings.py": "a correction names any field of any recorded event",
-    "service/audit/record/rows.py": "shows recorded events even where they are altered and no longer records",
-    "service/audit/replay/recomputed.py": "arguments of a job with recomputed answers, before its kind reads them",
+    "service/audit/findings.py": "a correction names any field of any recorded event",
+    "service/audit/queries.py": "shows recorded events even where they are altered and no longer records",
+    "service/audit/replay.py": "arguments of a job with recomputed answers, before its kind reads them",
     "service/core/jobs.py": "hashes recorded arguments of any kind of job; references as they stand in them",
     "service/core/records/base.py": "writes a record into an event",
     "service/import_folder.py": "the camera of an event, as a photograph states it",
@@ -34,7 +34,7 @@ EDGES = {
     "service/store/verification/file_checks.py": "checks rows that may be altered and no longer records",
     "service/store/verification/people_checks.py": "checks rows that may be altered and no longer records",
     "service/store/verification/signature_checks.py": "checks rows that may be altered and no longer records",
-    "service/audit/verify/bundle_verifier.py": "stands alone in a bundle, with nothing but the standard library",
+    "service/audit/bundle_verifier.py": "stands alone in a bundle, with nothing but the standard library",
     # files
     "service/compute/hand_held.py": "writes and reads the file of a hand-held image",
     "service/compute/markers/records.py": "writes and reads files of outlines",

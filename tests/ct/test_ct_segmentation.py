@@ -15,9 +15,9 @@ from pydicom.uid import generate_uid
 from drivers.dicom_folder import DicomFolderConfig
 from drivers.dicom_folder.folder import DicomFolder
 from drivers.interfaces import CtSource
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.run_events import FilesKept
 from service.core.run.state import RunState

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.audit.record.run import RecordedRun, read_run
-from service.audit.replay.recomputed import ScratchStore
+from service.audit.recorded_run import RecordedRun, read_run
+from service.audit.replay import ScratchStore
 from service.computations.job import JobAnswer
 from service.computations.registration import Registration
 from service.compute.matching.pairs import relative_covariance

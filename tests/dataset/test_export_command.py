@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.cli.main import app
 from service.compute.images.render import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse

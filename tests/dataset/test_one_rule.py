@@ -9,9 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from service.audit.record.run import RecordedRun, read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html
+from service.audit.recorded_run import RecordedRun, read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array
 from service.core.run.state import RunState

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.audit.record.run import RecordedRun, read_run
+from service.audit.recorded_run import RecordedRun, read_run
 from service.compute.images.render import Cylinder, WorldSphere, marker_mask
 from service.compute.surfaces.constellations import match_constellations
 from service.core.geometry import apply

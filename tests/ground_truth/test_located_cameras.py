@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.computations.registration import REGISTER
 from service.computations.scans import LOCATE_SPHERES
 from service.core.geometry import apply, inverse

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.dataset.view_covariances import view_covariances
 from tests.support.rig.rig import orthocapture
 from tests.support.runs.run_by_hand import run_by_hand, small_protocol

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.core.jobs import jobs_of
 from service.dataset.summary import RunSummary
 from service.dataset.view_covariances import own_pose_errors

@@ -13,8 +13,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from service.audit.overview.first_page import verified
-from service.audit.verify.verifications import verification_of
+from service.audit.overview import verified
+from service.audit.verifications import verification_of
 from service.cli.main import app
 from service.store.durable_effects import SystemClock, utc_text
 from service.store.objects.anchors import (

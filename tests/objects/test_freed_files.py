@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from service.audit.record.run import RecordedFiles
+from service.audit.recorded_run import RecordedFiles
 from service.cli.main import app
 from service.core.errors import IntegrityError
 from service.store.backup import back_up

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from service.audit.verify.verifications import Verifications
+from service.audit.verifications import Verifications
 from service.cli.main import app
 from service.core.errors import ConfigurationError
 from service.core.records.entered import NAME_CHARACTERS, cleaned_name, looks_of, person_name

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.overview.findings import correct
+from service.audit.findings import correct
 from service.cli.main import app
 from service.core.errors import OrthocaptureError
 from service.core.records.entered import REASON_CHARACTERS

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import pytest
 
-from service.audit.record.run import RecordedFiles
-from service.audit.replay.recomputed import ScratchStore
+from service.audit.recorded_run import RecordedFiles
+from service.audit.replay import ScratchStore
 from service.computations.job import JobContext, RecordedContext
 from service.compute.sfm.options import SfmOptions, pairs_of
 from service.core.records.base import ArtefactRef

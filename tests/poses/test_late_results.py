@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 import pytest
 
+from service.audit import overview
 from service.audit.background import PartialProgress
-from service.audit.bundle.export import bundle_report, export_bundle
-from service.audit.overview import first_page
-from service.audit.overview.digest import Digest, digests
-from service.audit.verify.bundle_verifier import main as verify_bundle
+from service.audit.bundle import bundle_report, export_bundle
+from service.audit.bundle_verifier import main as verify_bundle
+from service.audit.overview import Digest, digests
 from service.cli.operators import Display
 from service.cli.run import wait_for_results
 from service.core.gates import evaluate_gates
@@ -171,10 +171,10 @@ def test_what_came_later_is_told_and_takes_nobodys_place(run: Run) -> None:
     assert "0.030 mm: not better than the run's own, robot with 0.020 mm" in first.text
     assert second.text.startswith("colmap: arrived 12 min after the end of the run.")
     assert "0.013 mm: better than the run's own" in second.text or "0.012 mm: better than" in second.text
-    assert first_page.counts(digest)["late_results"] == 2
-    assert [f.seq for f in first_page.findings(digest, "late_results")] == [first.seq, second.seq]
-    assert "late_results" in first_page.NOTE_GROUPS
-    assert first_page.findings(digest) == []  # not a deviation
+    assert overview.counts(digest)["late_results"] == 2
+    assert [f.seq for f in overview.findings(digest, "late_results")] == [first.seq, second.seq]
+    assert "late_results" in overview.NOTE_GROUPS
+    assert overview.findings(digest) == []  # not a deviation
 
 
 def test_the_first_page_shows_what_came_and_what_is_still_to_come(run: Run, tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.bundle.export import export_bundle
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html
+from service.audit.bundle import export_bundle
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html
 from service.core.records.run_events import RunCompleted
 from service.dataset.exporter import exporter, write_data_set
 from service.dataset.run_data_set import data_set_of

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from service.audit import overview
 from service.audit.background import PartialProgress
-from service.audit.overview import first_page
-from service.audit.overview.digest import digests
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html
+from service.audit.overview import digests
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html
 from service.cli.common import console
 from service.cli.main import app
 from service.core.gates import describe, describe_judged, figure, quantity, standing
@@ -78,15 +78,15 @@ def test_the_first_page_counts_what_is_not_decided_apart(undecided: tuple[Path, 
         digest = computed.get(run_id, wait_s=60.0)
         computed.close()
     assert not isinstance(digest, PartialProgress)
-    counted = first_page.counts(digest)
+    counted = overview.counts(digest)
     assert (counted["failed_gates"], counted["undecided_gates"]) == (1, 1)  # too few views before the redo
-    (one,) = first_page.findings(digest, "undecided_gates")
+    (one,) = overview.findings(digest, "undecided_gates")
     assert one.name == "Gate not decided"
     assert f"{BOUNDED}, allowed ≤ 0.35: not decided" in one.text
-    (failed,) = first_page.findings(digest, "failed_gates")
+    (failed,) = overview.findings(digest, "failed_gates")
     assert failed.name == "Gate failed"
-    assert {f.kind for f in first_page.failed_gates(digest)} == {"failed_gate", "undecided_gate"}
-    assert {f.kind for f in first_page.findings(digest)} == {d.kind for d in digest.deviations}
+    assert {f.kind for f in overview.failed_gates(digest)} == {"failed_gate", "undecided_gate"}
+    assert {f.kind for f in overview.findings(digest)} == {d.kind for d in digest.deviations}
 
 
 def test_the_report_shows_bounds_and_says_what_they_are(undecided: tuple[Path, str]) -> None:

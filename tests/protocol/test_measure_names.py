@@ -6,7 +6,7 @@ import pytest
 
 from docs.generate.pages import shipped_protocols
 from docs.generate.steps import measures_of_kind, steps_text
-from service.audit.report.blocks import measured
+from service.audit.report_blocks import measured
 from service.core.gates import describe
 from service.core.measure_names import MEASURE_NAMES, REGISTRATION_MEASURE_NAMES, measure_name
 from service.core.records.run_events import GateVerdict

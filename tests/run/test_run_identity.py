@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from service.audit.bundle.export import export_bundle
+from service.audit import bundle_verifier
+from service.audit.bundle import export_bundle
 from service.audit.filters import RunSearch
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output import render_html, write_pdf
-from service.audit.runs.search import find_runs
-from service.audit.verify import bundle_verifier
+from service.audit.recorded_run import read_run
+from service.audit.report import report_content
+from service.audit.report_output import render_html, write_pdf
+from service.audit.runs import find_runs
 from service.cli.main import app
 from service.core.records.entered import NoteTaken, RunAbout
 from service.core.records.events import PAYLOAD

@@ -16,8 +16,8 @@ from sqlalchemy import select, text
 from typer.testing import CliRunner
 
 from service.audit.filters import EventFilter
-from service.audit.record.rows import runs as listed_runs
-from service.audit.record.search import events_page
+from service.audit.queries import events_page
+from service.audit.queries import runs as listed_runs
 from service.cli.main import app
 from service.core.errors import ComputeError, StoreError
 from service.core.records.events import RecordCopied

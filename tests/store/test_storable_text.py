@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import export_bundle
+from service.audit.bundle import export_bundle
 from service.cli.main import app
 from service.computations.job import JobAnswer, JobContext
 from service.core.records.run_events import JobFailed, StepNote

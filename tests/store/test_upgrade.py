@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.audit.filters import EventFilter
-from service.audit.record.search import events_page
+from service.audit.queries import events_page
 from service.cli.main import app
 from service.core.records.events import RecordCopied
 from service.store.database.database import REVISIONS

@@ -20,8 +20,8 @@ import pytest
 import trimesh
 import yaml
 
-from service.audit.record.run import read_run
-from service.audit.replay.recomputed import CopiedResults
+from service.audit.recorded_run import read_run
+from service.audit.replay import CopiedResults
 from service.cli.demo import free_address
 from service.core.jobs import jobs_of, references_in
 from tests.support.processes.package import Package, installed_package

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.bundle.export import bundle_report, export_bundle
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.bundle import bundle_report, export_bundle
 from service.cli.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
 from service.core.records.run_events import EvidenceExported, RunReleased, StepNote
@@ -203,7 +203,7 @@ def test_nothing_is_overwritten_and_nothing_half_written_stays(
         def interrupted(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("service.audit.bundle.export.sign", interrupted)
+        monkeypatch.setattr("service.audit.bundle.sign", interrupted)
         with pytest.raises(KeyboardInterrupt):
             export_bundle(store, site.run_id, tmp_path / "c.zip", actor="ada")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b-SIMULATED.zip", "data"]

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.audit.bundle.contents import read_bundled_run, write_artefacts, write_records, writing_bundle
-from service.audit.bundle.crate import crate_json
-from service.audit.bundle.export import FORMAT, MANIFEST_PREFIX
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.bundle import FORMAT, MANIFEST_PREFIX
+from service.audit.bundle_contents import crate_json, read_bundled_run, write_artefacts, write_records, writing_bundle
 from service.core.arms import arm_model, flange_pose, known_arms
 from service.core.geometry import transform
 from service.core.records.run_events import DeviceOpened

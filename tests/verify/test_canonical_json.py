@@ -10,7 +10,7 @@ import rfc8785
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
 
 VALUES = st.recursive(
     st.none()

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
 from tests.support.record.bundled_site import Site, check, run_verifier
 
 

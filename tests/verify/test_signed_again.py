@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.bundle.export import export_bundle
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.bundle import export_bundle
 from service.core.errors import IntegrityError
 from service.store.records import SITE
 from service.store.signatures.log import NAME

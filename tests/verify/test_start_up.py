@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.record import starts
-from service.audit.record.starts import record_start
+from service.audit import starts
+from service.audit.starts import record_start
 from service.core.errors import ConfigurationError
 from service.core.records.events import ServiceStarted
 from service.core.records.run_events import RunAborted

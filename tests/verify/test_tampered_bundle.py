@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 import rfc8785
 
-from service.audit.bundle.export import export_bundle
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.bundle import export_bundle
 from service.store.artefacts import hash_file
 from service.store.signatures.signing import public_keys, rotate_key
 from service.store.store import Store

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from rfc3161_client import HashAlgorithm, TimestampRequestBuilder
 
-from service.audit.bundle.export import export_bundle
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.bundle import export_bundle
 from service.core.records.run_events import DeviceTrouble
 from service.rig import load_rig
 from service.run_start import time_stamp_authority as time_stamp_authority_of

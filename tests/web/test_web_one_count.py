@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.core.records.events import Payload
 from service.core.records.run_events import OperatorAction, StepFailed, StepStarted, ViewpointFailed
 from tests.support.pages.browsed_run import BrowsedRun, words

@@ -9,7 +9,7 @@ from urllib.parse import quote
 import pytest
 from fastapi.routing import APIRoute
 
-from service.audit.overview import first_page
+from service.audit import overview
 from service.people.person import may
 from service.store.verification.verify import verify
 from service.web import audit, audit_overview
@@ -64,8 +64,8 @@ def test_first_page_shows_deviations_before_everything_else(web: WebSite, run: s
     headings = re.findall(r"<h2[^>]*>(.*?)</h2>", text.split("<main", 1)[1])
     digest = digest_of(web.store, run)
     assert headings[0] == f'Deviations <span class="muted num">{len(digest.deviations)}</span>'
-    for group, number in first_page.counts(digest).items():
-        name = first_page.GROUPS[group][0]
+    for group, number in overview.counts(digest).items():
+        name = overview.GROUPS[group][0]
         assert re.search(rf'count-number num">{number}</span> <span class="count-name">{name}<', text), group
     assert "Simulated" in text
     assert "a hand in the picture 0" in text

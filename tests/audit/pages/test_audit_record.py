@@ -9,15 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.audit import findings, overview, queries
 from service.audit.background import PartialProgress
 from service.audit.filters import ArtefactFilter, EventFilter
-from service.audit.overview import findings, first_page
-from service.audit.overview.digest import digests
-from service.audit.overview.findings import correct
-from service.audit.overview.signatures import signatures as signatures_of
+from service.audit.findings import correct
+from service.audit.findings import signatures as signatures_of
+from service.audit.overview import digests
 from service.audit.provenance import draw, graphs, origin
-from service.audit.record import rows, search
-from service.audit.record.search import EventPage
+from service.audit.queries import EventPage
 from service.core.errors import DataError
 from service.core.records.run_events import StepNote
 from service.core.run.fold import fold
@@ -50,7 +49,7 @@ def test_digest_agrees_with_the_fold_of_all_events(store: Store, run: str) -> No
     assert {d.kind for d in state.deviations} >= {"refused", "viewpoint_skipped", "redo_viewpoint"}
     for field in ("status", "people", "superseded", "released_by", "current", "machine_state", "completed_sha256"):
         assert getattr(digest.state, field) == getattr(state, field), field
-    assert first_page.counts(digest)["skipped_views"] == sum(d.kind == "viewpoint_skipped" for d in state.deviations)
+    assert overview.counts(digest)["skipped_views"] == sum(d.kind == "viewpoint_skipped" for d in state.deviations)
     assert sum(digest.facets.kinds.values()) == digest.seq == len(store.events(run))
 
 
@@ -97,7 +96,7 @@ def test_large_run_says_how_far_it_is_instead_of_waiting(store: Store, run: str)
 
 def page_of(store: Store, run: str, wanted: EventFilter, **where: int) -> EventPage:
     with store.database.reading() as connection:
-        return search.events_page(connection, run, wanted, **where)
+        return queries.events_page(connection, run, wanted, **where)
 
 
 def every_page(store: Store, run: str, wanted: EventFilter) -> list[int]:
@@ -152,23 +151,23 @@ def test_pages_go_back_the_way_they_came(store: Store, run: str) -> None:
 def test_no_filter_breaks_the_search(store: Store, run: str, q: str, step: str, after: int, before: int) -> None:
     page = page_of(store, run, EventFilter(q=q, step=step), after=after, before=before)
     assert page.count is not None
-    assert len(page.rows) <= rows.PAGE
+    assert len(page.rows) <= queries.PAGE
 
 
 def test_every_event_shows_its_content_and_its_hash_holds(store: Store, run: str) -> None:
     events = store.events(run)
     with store.database.reading() as connection:
         for seq in (1, 2, len(events) // 2, len(events)):
-            row = rows.one_event(connection, run, seq)
+            row = queries.one_event(connection, run, seq)
             event = events[seq - 1]
             assert (row.sha256, row.previous_sha256) == (event.sha256, event.previous_sha256)
-            assert rows.computed_sha256(run, row) == row.sha256
-            assert rows.seq_of_hash(connection, run, event.sha256) == seq
+            assert queries.computed_sha256(run, row) == row.sha256
+            assert queries.seq_of_hash(connection, run, event.sha256) == seq
             assert row.payload == event.payload.model_dump(mode="json")
-        assert rows.seq_of_hash(connection, run, "f" * 64) is None
+        assert queries.seq_of_hash(connection, run, "f" * 64) is None
         for seq in (0, -1, len(events) + 1, 10**30):
             with pytest.raises(UnknownRunError):
-                rows.one_event(connection, run, seq)
+                queries.one_event(connection, run, seq)
 
 
 def test_events_missing_from_the_index_are_told(tmp_path: Path) -> None:
@@ -196,12 +195,12 @@ def test_artefacts_are_found_by_every_property(store: Store, run: str) -> None:
             (ArtefactFilter(q="%"), 0),
             (ArtefactFilter(q="SC0000_"), 0),
         ):
-            found = search.artefacts_page(connection, run, wanted)
+            found = queries.artefacts_page(connection, run, wanted)
             assert found.count == expected, wanted
-        last = search.artefacts_page(connection, run, ArtefactFilter(), page=10**9)
+        last = queries.artefacts_page(connection, run, ArtefactFilter(), page=10**9)
         assert last.page == last.pages
         with pytest.raises(UnknownRunError):
-            search.one_artefact(connection, run, "'; DROP TABLE artefacts")
+            queries.one_artefact(connection, run, "'; DROP TABLE artefacts")
 
 
 @pytest.mark.parametrize(("q", "found"), [("Übersicht", 1), ("ÜBERSICHT", 1), ("bersicht.JPG", 1), ("Ubersicht", 0)])
@@ -213,7 +212,7 @@ def test_an_artefact_is_found_by_a_name_with_letters_of_any_language(tmp_path: P
             run, [captured(ref, "v1")], actor="camera", artefacts=[NewArtefact(ref, "camera", "step", 1, "v1")]
         )
         with store.database.reading() as connection:
-            assert search.artefacts_page(connection, run, ArtefactFilter(q=q)).count == found
+            assert queries.artefacts_page(connection, run, ArtefactFilter(q=q)).count == found
 
 
 def test_provenance_runs_from_scans_to_the_registration(tmp_path: Path) -> None:
@@ -261,7 +260,7 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
         correct(store, run, of_seq=2, field="host", new="table 3", reason="again", actor="emmy")
         with store.database.reading() as connection:
             values = findings.corrected_values(connection, run)
-            original = rows.one_event(connection, run, 2)
+            original = queries.one_event(connection, run, 2)
         assert [(v.correction.old, v.correction.new, v.original, v.latest) for v in values] == [
             ("here", "table 2", "here", False),
             (1, 7, 1, True),

@@ -12,7 +12,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "leases": ("service/store/runs.py", "service/store/jobs.py"),
     "chain": ("service/store/events.py", "service/store/store.py", "service/store/durable_effects.py"),
     "signatures": ("service/store/signatures/*.py",),
-    "verifier": ("service/store/verification/*.py", "service/audit/verify/bundle_verifier.py"),
+    "verifier": ("service/store/verification/*.py", "service/audit/bundle_verifier.py"),
     "cost": tuple(f"service/compute/registration/{name}.py" for name in ("problem", "solve")),
     "covariances": (
         "service/compute/camera_model.py",

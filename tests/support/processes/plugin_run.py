@@ -10,8 +10,8 @@ from docs.generate.jobs import jobs_text
 from docs.generate.steps import steps_text
 from service.audit.background import PartialProgress
 from service.audit.provenance import draw, graphs
-from service.audit.record.run import read_run
-from service.audit.replay.replay import replay
+from service.audit.recorded_run import read_run
+from service.audit.replay import replay
 from service.core.protocol import parse_protocol
 from service.steps import params_models
 from service.steps.protocol_check import implausible

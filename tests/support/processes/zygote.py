@@ -35,15 +35,15 @@ from tests.support.processes.quick_hashes import hash_quickly
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
 # What the pages start: modules of the program, each with those that it imports only once it needs them.
 OF_PAGES = {
-    "service.audit.export.exports": ("service.audit.export.posed",),
-    "service.audit.export.process": (
-        "service.audit.export.posed",
-        "service.audit.report.content",
-        "service.audit.report.output",
-        "service.audit.report.output",
+    "service.audit.exports": ("service.audit.data_set_export",),
+    "service.audit.export_process": (
+        "service.audit.data_set_export",
+        "service.audit.report",
+        "service.audit.report_output",
+        "service.audit.report_output",
     ),
-    "service.audit.verify.verifications": (),
-    "service.web.preview_process": ("service.audit.record.run", "service.dataset.preview"),
+    "service.audit.verifications": (),
+    "service.web.preview_process": ("service.audit.recorded_run", "service.dataset.preview"),
 }
 VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
     "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.audit.bundle.export import export_bundle
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.bundle import export_bundle
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.store import Store

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.cli.main import app
 from service.core.records.events import Event
 from service.core.records.run_events import JobEnqueued, JobFailed, JobFinished

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from service.audit.background import PartialProgress
-from service.audit.overview.digest import Digest, digests
+from service.audit.overview import Digest, digests
 from service.core.gates import evaluate_gates
 from service.core.protocol import Step, load_protocol
 from service.core.records.base import ArtefactRef

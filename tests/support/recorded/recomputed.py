@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from service.audit.record.run import RecordedRun
-from service.audit.replay.recomputed import ScratchStore
+from service.audit.recorded_run import RecordedRun
+from service.audit.replay import ScratchStore
 from service.computations.job import JobAnswer, JobContext, RecordedContext
 from service.computations.registration import REGISTER
 from service.core.jobs import jobs_of, resolve

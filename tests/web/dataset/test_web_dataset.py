@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.audit.record.run import read_run
+from service.audit.recorded_run import read_run
 from service.computations.benchmark import BenchmarkResult, ComputingEffort, Machine, Score
 from service.core.records.run_events import EvidenceExported
 from service.dataset.preview_records import (

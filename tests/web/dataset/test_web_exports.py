@@ -15,8 +15,8 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from service.audit.export.process import export
-from service.audit.verify import bundle_verifier
+from service.audit import bundle_verifier
+from service.audit.export_process import export
 from service.cli.main import app
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.errors import StoreError

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.export.exports import zip_chunks
-from service.audit.export.process import export
-from service.audit.export.wanted import ExportRequest, WantedExport, keep_request
+from service.audit.export_process import export
+from service.audit.exports import ExportRequest, WantedExport, keep_request, zip_chunks
 from service.core.errors import IntegrityError
 from service.core.records.run_events import EvidenceExported
 from service.dataset.export_folder import SUMS

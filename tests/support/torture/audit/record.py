@@ -10,8 +10,8 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from service.audit.overview.findings import correct
-from service.audit.record.starts import record_start
+from service.audit.findings import correct
+from service.audit.starts import record_start
 from service.core.errors import DataError
 from service.core.records.run_events import EvidenceExported, OperatorAction, RunAborted, RunReleased
 from service.people.control import Control

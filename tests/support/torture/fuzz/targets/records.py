@@ -21,9 +21,9 @@ import httpx
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rfc3161_client import HashAlgorithm, TimestampRequestBuilder
 
-from service.audit.bundle.export import export_bundle
-from service.audit.verify import bundle_verifier
-from service.audit.verify.verifications import Verifications
+from service.audit import bundle_verifier
+from service.audit.bundle import export_bundle
+from service.audit.verifications import Verifications
 from service.monitor.snapshot import Snapshot, read_snapshot, write_snapshot
 from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.events import to_event
@@ -346,7 +346,7 @@ def _web(data: bytes, _: Path) -> None:
             raise MisbehavedError(f"an answer without its safety headers: {address[:60]}")
 
 
-_CHECK = "service.audit.verify.bundle_verifier:Check.run"
+_CHECK = "service.audit.bundle_verifier:Check.run"
 _VERIFIER: dict[str, Any] = {"errors": (bundle_verifier.NotABundleError,), "says_place": False}
 _REFUSES_NOTHING: dict[str, Any] = {"errors": ()}
 

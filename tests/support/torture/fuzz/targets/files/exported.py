@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.audit.export.wanted import ExportRequest, WantedExport, keep_request, kept_request
+from service.audit.exports import ExportRequest, WantedExport, keep_request, kept_request
 from service.benchmark.matching import (
     MethodResult,
     markdown,
@@ -230,6 +230,6 @@ TARGETS: tuple[Target, ...] = (
     Target("unit_box", "service.benchmark.methods:from_unit_box", _box, _boxes, JSON),
     Target("own_ply", "service.compute.surfaces.surface:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview_records:read_preview", _preview, _previews, JSON),
-    Target("export_request", "service.audit.export.wanted:kept_request", _request, _requests, JSON),
+    Target("export_request", "service.audit.exports:kept_request", _request, _requests, JSON),
     Target("region", "service.run_acts:read_region", _region, _regions, JSON),
 )  # fmt: skip

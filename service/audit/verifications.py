@@ -93,7 +93,7 @@ class Verifications:
     def __init__(self, data: Path, clock: Clock) -> None:
         self._data = data
         self._clock = clock
-        self._children = ChildProcesses("service.audit.verify.verifications", "verification", clock)
+        self._children = ChildProcesses("service.audit.verifications", "verification", clock)
 
     def last(self, run_id: str) -> Verification | None:
         """Return the last result; None if there is none that can be read."""
@@ -120,7 +120,7 @@ class Verifications:
         keep_verification(self._data, run_id, Verification.model_validate_json(json.dumps(fields)))
 
 
-# Verifies a run in a process of its own, so that pages stay fast: `python -m service.audit.verify.verifications`.
+# Verifies a run in a process of its own, so that pages stay fast: `python -m service.audit.verifications`.
 #
 # It only reads the data folder, and ends when the process that started it ends.
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import (
+from service.audit.recorded_run import RecordedRun
+from service.audit.report_blocks import (
     Block,
     Column,
     DescriptionList,

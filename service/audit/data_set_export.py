@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 
 from service.audit.background import Progress
-from service.audit.bundle.export import record_export, require_exportable
-from service.audit.export.wanted import WantedExport
-from service.audit.record.run import not_in_yet, read_run
+from service.audit.bundle import record_export, require_exportable
+from service.audit.exports import WantedExport
+from service.audit.recorded_run import not_in_yet, read_run
 from service.core.errors import ConfigurationError
 from service.core.gates import refuse_data_set
 from service.core.records.data_set import VERSION

@@ -11,17 +11,17 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
-from service.audit.bundle.contents import (
+from service.audit.bundle_contents import (
     BundledRun,
     BundleZip,
     Progress,
     ZipTime,
+    crate_json,
     read_bundled_run,
     write_artefacts,
     write_records,
     writing_bundle,
 )
-from service.audit.bundle.crate import crate_json
 from service.core.errors import IntegrityError
 from service.core.gates import refuse_export
 from service.core.protocol import Protocol
@@ -217,9 +217,9 @@ def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[
 
     def make(audit: AuditReport, last_seq: int) -> bytes:
         # Imported here because numerics, pictures and the 3D scene take long to load, and only the report needs them.
-        from service.audit.record.run import read_run  # noqa: PLC0415
-        from service.audit.report.content import report_content  # noqa: PLC0415
-        from service.audit.report.output import render_html  # noqa: PLC0415
+        from service.audit.recorded_run import read_run  # noqa: PLC0415
+        from service.audit.report import report_content  # noqa: PLC0415
+        from service.audit.report_output import render_html  # noqa: PLC0415
 
         run = read_run(data, run_id, last_seq=last_seq)
         made_at = datetime.fromisoformat(run.events[-1].at_utc)

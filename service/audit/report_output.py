@@ -21,7 +21,7 @@ import typst
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup
 
-from service.audit.report.blocks import (
+from service.audit.report_blocks import (
     Block,
     DescriptionList,
     Drawing,
@@ -84,7 +84,7 @@ def render_html(report: Report) -> str:
 def _template() -> Template:
     """Return the template, which takes longer to compile than to fill in."""
     environment = Environment(
-        loader=PackageLoader("service.audit.report"),
+        loader=PackageLoader("service.audit"),
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -146,7 +146,7 @@ def render_pdf(report: Report) -> bytes:
     with tempfile.TemporaryDirectory(prefix="orthocapture-report-") as name:
         folder = Path(name)
         (folder / "report.json").write_text(json.dumps(_document(report, folder)), encoding="utf-8")
-        source = (files("service.audit.report") / "templates" / "report.typ").read_bytes()
+        source = (files("service.audit") / "templates" / "report.typ").read_bytes()
         found = [folder for folder in _FONT_FOLDERS if (Path(folder) / _FONT_FILE).is_file()][:1]
         for with_system, standard in _TRIES:
             fonts = typst.Fonts(include_system_fonts=with_system, font_paths=[*found])

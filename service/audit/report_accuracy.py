@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from service.audit.record.run import RecordedRun, not_in_yet
-from service.audit.report.blocks import (
+from service.audit.recorded_run import RecordedRun, not_in_yet
+from service.audit.report_blocks import (
     Block,
     Column,
     DescriptionList,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
 
-from service.audit.record.rows import EventRow, plain, read_rows
+from service.audit.queries import EventRow, plain, read_rows
 from service.core.recorded_devices import CameraBodies, RecordedReport, bodies_of, recorded_report
 from service.core.records.run_events import DeviceOpened, SessionStarted, ViewpointCaptured
 

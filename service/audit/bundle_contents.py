@@ -1,4 +1,4 @@
-"""What goes into a bundle: a run's records and files, read in one transaction, streamed into a zip file, hashed."""
+"""Reads what goes into a bundle in one transaction, streams it into a zip file, and describes it as an RO-Crate."""
 
 from __future__ import annotations
 
@@ -16,18 +16,32 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, select
 
-from service.audit.record.run import not_in_yet
+from service.audit.recorded_run import not_in_yet
 from service.core.errors import DataError, IntegrityError, StoreError
+from service.core.gates import describe_accepted
 from service.core.protocol import Protocol
-from service.core.records.run_events import RunStarted
+from service.core.recorded_devices import bodies, recorded_report
+from service.core.records.base import ArtefactRef
+from service.core.records.events import Event
+from service.core.records.import_list import imported_sentence
+from service.core.records.run_events import (
+    DeviceOpened,
+    JobEnqueued,
+    JobFinished,
+    RunStarted,
+    ViewHeld,
+    ViewImported,
+    ViewpointCaptured,
+)
 from service.core.run.fold import FoldedRun, fold
+from service.dataset.crate import CONTEXT, anchor, descriptor, device, file_entity, person, software
 from service.people.person import full_names
 from service.store.artefacts import chunks_of, read_artefacts
 from service.store.database.tables import artefacts as artefact_table
 from service.store.database.tables import events as event_table
 from service.store.database.tables import jobs as job_table
 from service.store.durable_effects import DurableFiles
-from service.store.events import canonical, event_text, parse_canonical, read_events
+from service.store.events import canonical, event_text, parse_canonical, read_events, references
 from service.store.records import SITE, Artefact
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 from service.store.signatures.signing import PublicKey
@@ -119,7 +133,7 @@ FINGERPRINT is the fingerprint of the site's signing key. Ask the site for it; d
 site sees it with `orthocapture audit keys`. This bundle states that it is
 {key_id}
 A verifier that comes with what it verifies could be forged as well. Take verify.py from an installation or a release
-of orthocapture that you trust (service/audit/verify/bundle_verifier.py, the same file byte for byte).
+of orthocapture that you trust (service/audit/bundle_verifier.py, the same file byte for byte).
 
 events.jsonl        everything that happened in the run: who, what, when (UTC and monotonic), one record per line.
                     sha256 is SHA-256 over the RFC 8785 canonical JSON of the other fields; previous_sha256 links
@@ -234,7 +248,7 @@ def write_records(bundle: BundleZip, store: Store, connection: Connection, run: 
     """Write both chains, signatures, keys, jobs, the protocol, the rig, a README and the verifier."""
     run_id, root = run.run_id, run.root
     bundle.add("README.txt", [readme(run_id, run.keys[-1].key_id, root, run.missing).encode()])
-    bundle.add("verify.py", [(files("service.audit.verify") / "bundle_verifier.py").read_bytes()])
+    bundle.add("verify.py", [(files("service.audit") / "bundle_verifier.py").read_bytes()])
     bundle.add("events.jsonl", _event_lines(connection, run_id))
     bundle.add("site_events.jsonl", _event_lines(connection, SITE))
     order = (artefact_table.c.seq, artefact_table.c.position)
@@ -300,3 +314,182 @@ def _job(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _key(key: PublicKey) -> dict[str, Any]:
     return asdict(key) | {"public_key": base64.b64encode(key.public_key).decode()}
+
+
+# --- RO-Crate 1.1: what is in the bundle, who made it, with what, and what came from what -------------------------
+
+_DESCRIPTIONS = {
+    "README.txt": "How to read and verify this bundle",
+    "events.jsonl": "The run's chain of events: one canonical JSON record a line",
+    "site_events.jsonl": "The site's chain: accounts, sign-ins, signing keys, starts of the service",
+    "artefacts.jsonl": "Where each recorded file came from",
+    "jobs.jsonl": "Computations",
+    "checkpoints.jsonl": "Ed25519 signatures over both chains",
+    "timestamps.jsonl": "RFC 3161 time stamps of checkpoints",
+    "keys.jsonl": "Public keys of the site, oldest first",
+    "protocol.yaml": "The protocol with which the run began",
+    "rig.yaml": "The rig with which the run began",
+    "report.html": "Report for people",
+    "verify.py": "Stand-alone verifier",
+}
+
+
+def crate_json(run: BundledRun, files: Sequence[ManifestEntry]) -> bytes:
+    """Return the metadata as canonical JSON. `files`: those in the bundle, which may lack recorded files."""
+    described = _artefact_entities(run.artefacts, {item.path for item in files})
+    ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
+    own = [
+        file_entity(item.path, item.sha256, item.size_bytes, _DESCRIPTIONS.get(item.path, ""))
+        for item in files
+        if not item.path.startswith("artefacts/")
+    ]
+    parts = [*own, *(entity for _, entity in described)]
+    named = sorted({*run.state.people, *filter(None, (run.root.operator, run.state.released_by))})
+    people = [person(name, run.full_names) for name in named]
+    devices = list(_devices(run.events))
+    actions = [*_captures(run.events, ids, {d["@id"] for d in devices}), *_jobs(run.events, ids)]
+    dataset = _dataset(run) | {
+        "author": [{"@id": one["@id"]} for one in people],
+        "hasPart": [{"@id": part["@id"]} for part in parts if part["@type"] == "File"],
+        "mentions": [{"@id": item["@id"]} for item in (*(p for p in parts if p["@type"] != "File"), *actions)],
+    }
+    graph = [*_about(run.root, dataset), *people, *devices, *parts, *actions]
+    return canonical({"@context": CONTEXT, "@graph": graph}).encode()
+
+
+def _dataset(run: BundledRun) -> dict[str, Any]:
+    root = run.root
+    marked = "SIMULATED " if root.simulated else ""
+    accepted = [f"{name}: {describe_accepted(s.accepted)}" for name, s in run.state.steps.items() if s.accepted]
+    return {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"{marked}Evidence of run {run.run_id}",
+        "description": (
+            f"{marked}Evidence of {root.protocol_id} {root.protocol_version}: every event, signature and file."
+            + (" No real device took part: the whole rig was simulated." if root.simulated else "")
+            + (f" {imported_sentence(run.events[0].at_utc, root.operator)}." if root.origin == "imported" else "")
+            + "".join(f" Accepted outside its limits: {text}." for text in accepted)
+            + (f" Not in when this was made: {'; '.join(run.missing)}." if run.missing else "")
+        ),
+        "datePublished": run.events[-1].at_utc,
+        "license": {"@id": "#rights"},
+        "keywords": ["simulated"] if root.simulated else [],
+    }
+
+
+def _about(root: RunStarted, dataset: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the metadata file, the data set, the rights and the software, in the order of the graph."""
+    return [
+        descriptor(),
+        dataset,
+        {
+            "@id": "#rights",
+            "@type": "CreativeWork",
+            "name": "Rights",
+            "description": "This bundle grants none; ask the site that made it.",
+        },
+        software(root.software.get("orthocapture", "unknown")),
+    ]
+
+
+def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list[tuple[Artefact, dict[str, Any]]]:
+    """Describe each distinct content once. Recorded files that are not in the bundle are not of type File."""
+    found: dict[str, tuple[Artefact, dict[str, Any]]] = {}
+    for artefact in artefacts:
+        ref = artefact.ref
+        path = f"artefacts/{ref.sha256[:2]}/{ref.sha256}"
+        entity = {
+            "@id": path if path in present else f"#artefact-{ref.sha256}",
+            "@type": "File" if path in present else "CreativeWork",
+            "name": ref.original_name,
+            "additionalType": ref.kind,
+            "encodingFormat": ref.media_type,
+            "contentSize": str(ref.size_bytes),
+            "sha256": ref.sha256,
+            "dateCreated": artefact.at_utc,
+        }
+        found.setdefault(ref.sha256, (artefact, entity))
+    return list(found.values())
+
+
+def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
+    """Yield every device as it first answered."""
+    opened: dict[str, DeviceOpened] = {}
+    for event in events:
+        if isinstance(event.payload, DeviceOpened):
+            opened.setdefault(event.payload.device, event.payload)
+    known = bodies(events)
+    for name, payload in opened.items():
+        identity = recorded_report(payload.report).identity
+        entity = device(name, identity.model, identity.firmware, known.shown(identity))
+        # As its connection states it, where photographs state the body's own: one camera.
+        yield entity | ({"identifier": identity.serial} if known.shown(identity) != identity.serial else {})
+
+
+def _captures(events: Sequence[Event], ids: Mapping[str, str], devices: set[str]) -> Iterable[dict[str, Any]]:
+    camera = anchor("device", "camera")
+    for event in events:
+        payload = event.payload
+        if isinstance(payload, (ViewpointCaptured, ViewHeld)):
+            yield {
+                "@id": f"#event-{event.seq}",
+                "@type": "CreateAction",
+                "name": f"Capture of {payload.viewpoint}, attempt {payload.attempt} of {payload.step}",
+                "instrument": [{"@id": camera if camera in devices else "#software"}],
+                "endTime": event.at_utc,
+                "result": _links(payload.artefacts, ids),
+            }
+        elif isinstance(payload, ViewImported):
+            yield {
+                "@id": f"#event-{event.seq}",
+                "@type": "CreateAction",
+                "name": f"Import of {payload.file_name} as {payload.viewpoint} in {payload.step}",
+                "description": "How the photograph was captured is not in evidence.",
+                "agent": {"@id": anchor("person", payload.imported_by)},
+                "instrument": [{"@id": "#software"}],
+                "endTime": event.at_utc,
+                "result": _links(payload.artefacts, ids),
+            }
+
+
+def _jobs(events: Sequence[Event], ids: Mapping[str, str]) -> Iterable[dict[str, Any]]:
+    enqueued = {e.payload.job: e for e in events if isinstance(e.payload, JobEnqueued)}
+    for event in events:
+        payload = event.payload
+        if not isinstance(payload, JobFinished):
+            continue
+        begun = enqueued.get(payload.job)
+        arguments = begun.payload.arguments if begun is not None and isinstance(begun.payload, JobEnqueued) else {}
+        yield {
+            "@id": anchor("job", payload.job),
+            "@type": "CreateAction",
+            "name": f"{payload.job_kind} for {payload.step}",
+            "instrument": {"@id": "#software"},
+            "startTime": event.at_utc if begun is None else begun.at_utc,
+            "endTime": event.at_utc,
+            "actionStatus": {"@id": "http://schema.org/CompletedActionStatus"},
+            "object": _named(arguments, ids),
+            "result": _links(payload.artefacts, ids),
+        }
+
+
+def _links(refs: Iterable[ArtefactRef], ids: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"@id": ids[ref.sha256]} for ref in refs if ref.sha256 in ids]
+
+
+def _named(arguments: Mapping[str, Any], ids: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return the recorded files that a job's arguments name, as references or by their hash alone."""
+    found = {ref.sha256: None for ref in references(arguments)} | dict.fromkeys(_hashes(arguments, ids))
+    return [{"@id": ids[sha256]} for sha256 in found if sha256 in ids]
+
+
+def _hashes(value: object, ids: Mapping[str, str]) -> Iterable[str]:
+    if isinstance(value, str) and value in ids:
+        yield value
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _hashes(item, ids)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _hashes(item, ids)

@@ -1,4 +1,4 @@
-"""Makes one export in a process of its own, so that pages stay fast: `python -m service.audit.export.process`.
+"""Makes one export in a process of its own, so that pages stay fast: `python -m service.audit.export_process`.
 
 It finishes the export even if the process that started it has ended.
 """
@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.audit.background import Progress, ends_tidily_when_stopped, report
-from service.audit.bundle.contents import writing_bundle
-from service.audit.bundle.export import bundle_report, export_bundle, marked_name, record_export, require_exportable
-from service.audit.export.exports import FORMAT
-from service.audit.export.wanted import forget_request, kept_request
+from service.audit.bundle import bundle_report, export_bundle, marked_name, record_export, require_exportable
+from service.audit.bundle_contents import writing_bundle
+from service.audit.exports import FORMAT, forget_request, kept_request
 from service.core.errors import ConfigurationError
 from service.machine.executors import computing_as_environment_says
 from service.machine.resources import compute_in_background
@@ -24,7 +23,7 @@ from service.store.disk_space import require_export_space
 from service.store.store import Store
 
 if TYPE_CHECKING:
-    from service.audit.record.run import RecordedRun
+    from service.audit.recorded_run import RecordedRun
     from service.store.verification.verify import AuditReport
 
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # the earliest time in zip; the files state their own dates
@@ -49,7 +48,7 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
             require_export_space(store, run_id, target)
         exportable = require_exportable(store, run_id, progress, unreleased=what in ("report", "report_pdf"))
         # Imported here because numerics and typesetting take long to load, and a bundle needs neither.
-        from service.audit.record.run import read_run  # noqa: PLC0415
+        from service.audit.recorded_run import read_run  # noqa: PLC0415
 
         run = read_run(data, run_id)
         path = target.with_name(marked_name(target.name, simulated=run.root.simulated))
@@ -75,7 +74,7 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
 
 def _in_format(store: Store, run_id: str, target: Path, actor: str, progress: Progress) -> Path:
     """Write the format that the request beside the folder names; goes on with what an interrupted export wrote."""
-    from service.audit.export.posed import export_data_set  # noqa: PLC0415 - as above
+    from service.audit.data_set_export import export_data_set  # noqa: PLC0415 - as above
 
     try:
         export_data_set(store, run_id, kept_request(target).wanted, target, actor, progress)
@@ -85,7 +84,7 @@ def _in_format(store: Store, run_id: str, target: Path, actor: str, progress: Pr
 
 
 def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
-    from service.audit.record.run import not_in_yet  # noqa: PLC0415
+    from service.audit.recorded_run import not_in_yet  # noqa: PLC0415
     from service.dataset.exporter import exporter, write_data_set  # noqa: PLC0415
     from service.dataset.run_data_set import data_set_of  # noqa: PLC0415
 
@@ -98,8 +97,8 @@ def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable
 
 
 def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool) -> None:
-    from service.audit.report.content import report_content  # noqa: PLC0415
-    from service.audit.report.output import write_html, write_pdf  # noqa: PLC0415
+    from service.audit.report import report_content  # noqa: PLC0415
+    from service.audit.report_output import write_html, write_pdf  # noqa: PLC0415
 
     (write_pdf if pdf else write_html)(report_content(run, audit, with_scene=not pdf), path)
 

@@ -1,1 +1,0 @@
-"""The evidence of a run as one file for people outside."""

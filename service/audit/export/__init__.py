@@ -1,1 +1,0 @@
-"""Exports requested in the browser, each made by a process of its own."""

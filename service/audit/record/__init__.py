@@ -1,1 +1,0 @@
-"""Read-only access to the runs, events and files of the evidence."""

@@ -1,1 +1,0 @@
-"""Recorded computations done again and compared with the record."""

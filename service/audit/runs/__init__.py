@@ -1,1 +1,0 @@
-"""Several runs at once: searching, comparing, and figures over time."""

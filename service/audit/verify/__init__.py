@@ -1,1 +1,0 @@
-"""Verification of the evidence, here and by the stand-alone verifier of a bundle."""
