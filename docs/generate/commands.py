@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from service.cli.exit_status import MEANINGS
+from service.cli.ending import MEANINGS
 from service.cli.main import app
 
 _HEAD = """\

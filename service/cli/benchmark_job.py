@@ -9,7 +9,7 @@ from pathlib import Path
 from service.benchmark.methods import Method, missing
 from service.benchmark.recorded import WantedBenchmark, benchmark_job, write_answer
 from service.cli.common import console, error_console
-from service.cli.stop_request import stop_requested
+from service.cli.ending import stop_requested
 from service.computations.benchmark import KIND, BenchmarkResult
 from service.core.errors import ComputeError, IntegrityError
 from service.core.records.run_events import JobFailed, JobFinished

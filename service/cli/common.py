@@ -21,7 +21,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from typer.models import OptionInfo
 
-from service.cli.exit_status import ExitStatus, exit_status
+from service.cli.ending import ExitStatus, exit_status
 from service.cli.terminal_output import Terminal, bar_of_shares
 from service.core.errors import ConfigurationError, OrthocaptureError, ProtocolError
 from service.core.words import shown, shown_json, shown_lines

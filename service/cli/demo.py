@@ -36,7 +36,7 @@ from service.cli.common import (
     require_writable_folder,
     shipped_protocols,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.run import drive, end_with_children, sigterm_like_ctrl_c
 from service.computations.evaluate import Row
 from service.compute.registration.accuracy import true_error_m

@@ -28,7 +28,7 @@ from service.cli.common import (
     protocol_file,
     reporting_errors,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.run import RigOption
 from service.core.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError

@@ -20,7 +20,7 @@ from service.cli.common import (
     tell_doubt,
     write_whole,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.computations.fuse.compute import MEANINGS, STAGES, FusedMeshes, MeshFusionSettings, fuse_meshes
 from service.compute.surfaces.align import align
 from service.compute.surfaces.fuse import Source

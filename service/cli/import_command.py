@@ -24,7 +24,7 @@ from service.cli.common import (
     reporting_errors,
     shipped_protocols,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.operators import part_of
 from service.cli.options import (
     OperatorOption,

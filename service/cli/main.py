@@ -1,4 +1,4 @@
-"""`orthocapture`: the command line, assembled from one file per command or group of commands."""
+"""`orthocapture`: the command line, assembled from a file for the commands of each subject."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.core.loading import begin_loading, end_loading
 from service.core.words import shown, shown_lines
 from service.logs import show_own_words_only
@@ -68,7 +68,7 @@ _COMMANDS = {
         "service.cli.act:note_command",
         "Write a note on a step of a run, with or without a photograph; the run goes on as it was.",
     ),
-    "status": _Command("service.cli.status:status_command", "Show the state of a run: steps, gates, deviations."),
+    "status": _Command("service.cli.runs:status_command", "Show the state of a run: steps, gates, deviations."),
     "runs": _Command(
         "service.cli.runs:runs_command", "List the recorded runs, newest first: all, or those that match."
     ),
@@ -89,18 +89,18 @@ _COMMANDS = {
         "Open every device of a rig; report versions, clock offsets, free space and problems.",
     ),
     "dicom-listen": _Command(
-        "service.cli.dicom_listen:dicom_listen_command",
+        "service.cli.worker:dicom_listen_command",
         "Receive CT series and segmentations that a CT suite sends (DICOM C-STORE), until it is terminated.",
     ),
     "calibrate": _Command(
         "service.cli.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
     ),
     "import-ros": _Command(
-        "service.cli.import_ros:import_ros_command",
+        "service.cli.conversion:import_ros_command",
         "Take images, robot poses, camera and mount from a ROS 2 recording; the files fit the other commands.",
     ),
     "develop": _Command(
-        "service.cli.develop:develop_command",
+        "service.cli.conversion:develop_command",
         "Develop raw files to linear TIFFs of 16 bits, always in the same way; needs the extra `raw`.",
     ),
     "sfm": _Command(
@@ -116,7 +116,7 @@ _COMMANDS = {
         "Find every sphere of a given radius in a mesh or point cloud, with its covariance and fit.",
     ),
     "layout": _Command(
-        "service.cli.layout:layout_command",
+        "service.cli.spheres:layout_command",
         "Check how well the spheres can be told apart, and suggest which to move. Exit status 1: some must be moved.",
     ),
     "fuse": _Command(
@@ -144,9 +144,9 @@ _COMMANDS = {
         "service.cli.export:export_command",
         "Write the data set of a completed run in a format that others read: images, poses, depth, masks, mesh.",
     ),
-    "accounts": _Command("service.cli.accounts:accounts_app", "Maintain the accounts of a site."),
+    "accounts": _Command("service.cli.store:accounts_app", "Maintain the accounts of a site."),
     "protocol": _Command("service.cli.protocol:protocol_app", "Check a protocol file before it is used."),
-    "plan": _Command("service.cli.plan:plan_app", "Plan viewpoints, before and during a capture."),
+    "plan": _Command("service.cli.protocol:plan_app", "Plan viewpoints, before and during a capture."),
 }
 # Under which heading the help lists each command; the order is that of the help.
 _GROUPS = {

@@ -24,7 +24,7 @@ from service.cli.common import (
     tell_left_out,
     write_whole,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.scheduler import (
     PATIENCE_S,
     SchedulerCaOption,

@@ -27,7 +27,7 @@ from service.cli.common import (
     require_writable_folder,
     write_whole,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.terminal_output import styled
 from service.computations import term
 from service.core.errors import OrthocaptureError

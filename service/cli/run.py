@@ -29,7 +29,7 @@ from service.cli.common import (
     protocol_file,
     reporting_errors,
 )
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus, stop_requested
 from service.cli.operators import (
     AutomaticOperator,
     Display,
@@ -48,8 +48,7 @@ from service.cli.options import (
     acting_person,
     described,
 )
-from service.cli.status import status_record
-from service.cli.stop_request import stop_requested
+from service.cli.runs import status_record
 from service.core.errors import ConfigurationError, PersonNeededError
 from service.core.protocol import Protocol, load_protocol
 from service.core.records.entered import about_run

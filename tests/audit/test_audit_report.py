@@ -296,7 +296,7 @@ def test_command_records_what_leaves_before_it_is_there(tmp_path: Path, monkeypa
     assert (event.payload.what, event.payload.file_name, event.payload.head_sha256) == ("report", "r.html", head)
     assert event.payload.sha256 == hashlib.sha256(html.read_bytes()).hexdigest()
     assert head in html.read_text()
-    monkeypatch.setattr("service.cli.audit_report._writable", lambda _data: False)  # a copy on a read-only medium
+    monkeypatch.setattr("service.cli.audit._writable", lambda _data: False)  # a copy on a read-only medium
     assert json.loads(CliRunner().invoke(app, words).stdout)["recorded"] is False
     assert len(told()) == 1
     assert verify(data, run_id).ok

@@ -39,7 +39,7 @@ print(number)
 """
 _TERMINATION = "from simulators.serve import Termination as made"
 _REQUEST = """
-from service.cli.stop_request import stop_requested
+from service.cli.ending import stop_requested
 
 contexts = []
 

@@ -1,4 +1,4 @@
-"""A command ends with a status of the table in service/cli/exit_status.py, by its name and not by its number."""
+"""A command ends with a status of the table in service/cli/ending.py, by its name and not by its number."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ EDGES = {
     "service/cli/fuse.py": "prints JSON",
     "service/cli/audit.py": "prints JSON",
     "service/cli/replay.py": "prints JSON",
-    "service/cli/status.py": "prints JSON",
+    "service/cli/runs.py": "prints JSON",
     "service/cli/import_command.py": "prints JSON",
 }
 

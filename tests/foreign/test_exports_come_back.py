@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.import_ros import keep_image
+from service.cli.conversion import keep_image
 from service.cli.main import app
 from service.compute.poses.pose_files import read_camera_json, read_poses
 from service.compute.poses.ros_messages import StampedImage

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.cli.status import status_record
+from service.cli.runs import status_record
 from service.computations import job_kinds
 from service.core.gates import late_s, late_words
 from service.core.geometry import look_at

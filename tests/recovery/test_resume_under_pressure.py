@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.run import end_with_children
 from service.core.records.run_events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
 from tests.recovery.test_resume import captured, recorded, short_protocol, wait_for, wait_for_captures

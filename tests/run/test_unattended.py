@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from service.cli.exit_status import ExitStatus
+from service.cli.ending import ExitStatus
 from service.cli.main import app
 from service.cli.operators import AutomaticOperator, Display, SimulatedHands, TerminalOperator
 from service.cli.terminal_output import Terminal

@@ -1,15 +1,16 @@
-"""`orthocapture import-ros`: images, robot poses, camera and mount of a ROS 2 recording, for other commands."""
+"""`orthocapture import-ros` and `develop`: a ROS 2 recording and raw files become files for the other commands."""
 
 from __future__ import annotations
 
+import hashlib
 import json as json_module
 import shutil
 from collections import Counter
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,7 +21,9 @@ from service.cli.common import (
     reporting_errors,
     require_writable_folder,
     tell_left_out,
+    write_whole,
 )
+from service.compute.photography import PARAMETERS
 from service.compute.poses.pose_files import write_camera_json, write_poses_csv
 from service.compute.poses.ros_messages import StampedImage, StampedTransform
 from service.compute.poses.ros_recording import (
@@ -37,6 +40,11 @@ from service.core.geometry import Transform
 from service.core.picture_files import kind_of
 from service.core.units import ms, nanoseconds, seconds_of_ms, seconds_of_ns
 from service.core.words import counted
+
+if TYPE_CHECKING:
+    from service.computations.further_cameras.compute import DevelopedFile
+
+# --- `import-ros`: images, robot poses, camera and mount of a ROS 2 recording -------------------------------------
 
 _SUFFIXES = {"JPEG": ".jpg", "PNG": ".png"}
 _HAND_EYE_NOTE = "from the static transforms of the recording; no uncertainty is stated there"
@@ -105,7 +113,7 @@ def import_ros_command(
             left_out |= taken.left_out
             if not poses:
                 raise _nothing(left_out, file)
-            written = _write(part, found, tree, poses, flange=flange, camera_frame=camera_frame)
+            written = _write_recording(part, found, tree, poses, flange=flange, camera_frame=camera_frame)
             record = {
                 "recording": str(file),
                 "image_topic": topic,
@@ -225,7 +233,7 @@ def _poses(
     return poses, left_out
 
 
-def _write(
+def _write_recording(
     out: Path, found: Recording, tree: FrameTree, poses: dict[str, FoundPose], *, flange: str, camera_frame: str
 ) -> list[str]:
     """Write poses, camera and mount; returns the names of the files."""
@@ -279,3 +287,81 @@ def _words(poses: dict[str, FoundPose]) -> str:
             far = ms(seconds_of_ns(max(one.away_ns for one in kind)))
             text += f", {len(kind)} {what} (messages up to {far:.3f} ms away)"
     return text
+
+
+# --- `develop`: linear TIFFs of 16 bits, with fixed parameters and a record beside each ---------------------------
+
+_JPEGS = (".jpg", ".jpeg")
+
+
+def develop_command(
+    files: Annotated[list[Path], typer.Argument(help="Raw files that LibRaw reads: ARW, CR3, NEF, DNG.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the TIFFs and their records.", file_okay=False)],
+    demosaic: Annotated[
+        str, typer.Option("--demosaic", help="LibRaw's algorithm, as rawpy names it.")
+    ] = PARAMETERS.demosaic,
+    json: JsonOption = False,
+) -> None:
+    """Develop raw files to linear TIFFs of 16 bits, always in the same way; needs the extra `raw`.
+
+    A JPEG of the same name beside a raw file gives the picture its size, and its place is checked against it.
+    """
+    from service.computations.further_cameras.compute import develop_file  # noqa: PLC0415 - the numerics, which `import-ros` does without
+
+    with reporting_errors(json):
+        _require_new(files, out)
+        records: list[dict[str, Any]] = []
+        for file in files:
+            jpeg = _jpeg_of(file)
+            parameters = replace(PARAMETERS, demosaic=demosaic)
+            made = develop_file(file, jpeg, parameters)
+            records.append(_write_developed(made, file, jpeg, out))
+            if not json:
+                _tell(records[-1], jpeg)
+        if json:
+            print_json(records)
+
+
+def _require_new(files: list[Path], out: Path) -> None:
+    """Require that nothing is overwritten, and that every raw file has a name of its own."""
+    require_writable_folder(out)
+    stems = [file.stem for file in files]
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice is not None:
+        raise ConfigurationError(f"two raw files are called {twice}", where=str(out), remedy="Use a folder for each")
+    there = next((path for stem in stems if (path := out / f"{stem}.tif").exists()), None)
+    if there is not None:
+        raise ConfigurationError("the file exists", where=str(there), remedy="Name another folder with --out")
+
+
+def _jpeg_of(raw: Path) -> Path | None:
+    """Return the JPEG of the same name, if there is one."""
+    if not raw.is_file():
+        raise DataError("the file does not exist", where=str(raw), remedy="Check the path")
+    beside = (path for path in raw.parent.iterdir() if path.stem == raw.stem and path.suffix.lower() in _JPEGS)
+    return min(beside, default=None)
+
+
+def _write_developed(made: DevelopedFile, raw: Path, jpeg: Path | None, out: Path) -> dict[str, Any]:
+    out.mkdir(exist_ok=True)
+    write_whole(out / f"{raw.stem}.tif", made.tiff)
+    record: dict[str, Any] = {
+        "raw": _named(raw.name, raw.read_bytes()),
+        "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
+        "tiff": _named(f"{raw.stem}.tif", made.tiff),
+        **asdict(made.how),
+    }
+    write_whole(out / f"{raw.stem}.json", json_module.dumps(record, indent=1) + "\n")
+    return record
+
+
+def _named(name: str, data: bytes) -> dict[str, str]:
+    return {"name": name, "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def _tell(record: dict[str, Any], jpeg: Path | None) -> None:
+    crop, shift_px = record["crop"], record["largest_shift_px"]
+    place = "no JPEG beside it: its place is not checked"
+    if jpeg is not None:
+        place = f"at most {shift_px:.2f} px from {jpeg.name}"
+    console.print(f"{record['tiff']['name']}: {crop['width']} × {crop['height']} px, {place}")
