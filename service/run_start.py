@@ -15,7 +15,7 @@ from service.core.records.run_events import ActionRefused, OperatorAction, RunSt
 from service.core.run.state import RunState
 from service.rig import Rig, RigDevice, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root
-from service.runner.software import software_versions
+from service.runner.held_run import software_versions
 from service.steps.protocol_check import require_devices, require_plausible
 from service.store.disk_space import forecast_of, require_space
 from service.store.records import NewArtefact

@@ -23,7 +23,7 @@ from bench.machine import RESULTS, commit, machine
 from drivers.errors import DeviceError
 from drivers.lightbox import LightboxConfig, SerialLightbox, with_checksum, without_checksum
 from service.core.run.decide import AskOperator
-from service.runner.pedal import SECOND_PRESS_S, Pedal
+from service.runner.leave import SECOND_PRESS_S, Pedal
 
 POLL_S = 0.1  # service/runner/loop.py
 QUESTION = AskOperator("capture", "confirm", "Move?", (), ("confirm",))

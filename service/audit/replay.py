@@ -29,7 +29,7 @@ from service.core.records.run_events import GateVerdict, JobEnqueued, JobFinishe
 from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
 from service.dataset.summary import RunSummary
-from service.runner.software import software_versions
+from service.runner.held_run import software_versions
 from service.store.artefacts import hash_file
 from service.store.events import parse_canonical, payload_text
 from service.store.verification.verify import AuditReport, verify

@@ -14,7 +14,7 @@ from sqlalchemy import Connection, func, select
 from service.core.errors import ConfigurationError
 from service.core.records.events import Event, ServiceStarted
 from service.rig import Rig
-from service.runner.software import software_versions
+from service.runner.held_run import software_versions
 from service.store.database.tables import checkpoints, event_index, events, heads
 from service.store.durable_effects import Clock
 from service.store.events import to_event

@@ -21,9 +21,17 @@ from service.core.run.actions import VERBS, capture_refusal, record_to_sign, ref
 from service.core.run.fold import fold
 from service.core.run.state import RunState, connected_arms, lost_arms
 from service.followed_run import RunRecord, read_log
-from service.notes import NotePhotograph, require_size, take_note
 from service.people.sessions import Identity, People, identity_for, who_acts, who_pauses
-from service.run_acts import cancel_computation, read_region, see_robot, step_to_draw_for, tick_item
+from service.run_acts import (
+    NotePhotograph,
+    cancel_computation,
+    read_region,
+    require_size,
+    see_robot,
+    step_to_draw_for,
+    take_note,
+    tick_item,
+)
 from service.run_start import record_refusal, recorded_run
 from service.store.records import Job
 from service.store.store import Store

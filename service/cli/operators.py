@@ -29,7 +29,7 @@ from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.person import PeopleError
 from service.people.sessions import Identity, People, identity_for
-from service.runner.operator import AnswerBy
+from service.runner.held_run import AnswerBy
 from service.steps.kinds import ct_import, image_import, scan_import
 
 if TYPE_CHECKING:

@@ -37,8 +37,7 @@ from service.core.units import bytes_of_gigabytes
 from service.core.words import counted
 from service.logs import file_log
 from service.store.data_folder import kept_to
-from service.worker.pool import work_side_by_side
-from service.worker.uploading import uploading
+from service.worker.pool import uploading, work_side_by_side
 
 # --- `worker`: compute the jobs of a data folder ------------------------------------------------------------------
 

@@ -22,9 +22,8 @@ from service.core.run.state import JobState
 from service.core.words import counted
 from service.logs import at
 from service.monitor.snapshot import living_workers
-from service.runner.held_run import HeldRun
+from service.runner.held_run import HeldRun, Operator
 from service.runner.leave import LeaveWatch
-from service.runner.operator import Operator
 from service.runner.upkeep import DiskWatch
 from service.steps import step_kinds
 from service.steps.context import Devices, Evidence, LeaveToMove, StepContext, StepInterruptedError, StepOutcome

@@ -43,11 +43,8 @@ from service.core.run.expected import tries_words
 from service.core.run.state import HandWork, RunState
 from service.monitor.reporter import host_clock
 from service.runner.execution import Starvation, StepExecution, WorkerWatch, held_up_here
-from service.runner.held_run import HeldRun, held_run
-from service.runner.leave import LeaveWatch
-from service.runner.operator import AnswerBy, Operator
-from service.runner.pedal import Pedal
-from service.runner.software import software_versions
+from service.runner.held_run import AnswerBy, HeldRun, Operator, held_run, software_versions
+from service.runner.leave import LeaveWatch, Pedal
 from service.runner.upkeep import PASSING, ClockWatch, DiskWatch, RecordTrouble, Seal, short_collections
 from service.steps.context import Devices
 from service.store.database.database import Changes

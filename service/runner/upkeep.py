@@ -16,8 +16,7 @@ from service.core.protocol import Protocol
 from service.core.recorded_devices import clock_readings
 from service.core.records.run_events import DeviceTrouble, StepNote
 from service.followed_run import RunFollower
-from service.runner.held_run import HeldRun
-from service.runner.operator import Operator
+from service.runner.held_run import HeldRun, Operator
 from service.steps.context import Devices
 from service.store.disk_space import forecast_of, require_space
 from service.store.records import LeaseHeldError, LeaseLostError, RecordDamagedError

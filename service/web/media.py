@@ -22,7 +22,7 @@ from service.core.errors import OrthocaptureError
 from service.core.records.base import ArtefactRef, age_s
 from service.followed_run import RunRecord
 from service.monitor.snapshot import ask_for_frames, frame_path
-from service.notes import NOTE_PHOTOGRAPH
+from service.run_acts import NOTE_PHOTOGRAPH
 from service.store.artefacts import to_artefact
 from service.store.database.tables import artefacts
 from service.web.images import (

@@ -28,10 +28,10 @@ from service.core.records.run_events import ControlTaken, RunStarted
 from service.dataset.registrations import evaluated, shared_adjustment_note
 from service.followed_run import RunRecord
 from service.monitor.snapshot import STALE_S, read_snapshot
-from service.notes import NotePhotograph, require_size, take_note
 from service.people.control import Control
 from service.people.person import Account, Person
 from service.rig import SigningSection
+from service.run_acts import NotePhotograph, require_size, take_note
 from service.run_record import open_jobs, results_to_come
 from service.steps import step_kinds
 from service.store.disk_space import forecast_of

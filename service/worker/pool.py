@@ -1,4 +1,4 @@
-"""A worker that computes as many jobs in parallel as there are cores, each in a child process.
+"""A worker that computes as many jobs in parallel as there are cores, each in a child process; and its uploader.
 
 A child that dies is replaced, and its job is computed by another one. Jobs that a step waits for have their own
 children, so that they never queue behind long background computations.
@@ -12,24 +12,28 @@ import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from service.core.errors import ConfigurationError
 from service.core.run.state import Lane
 from service.logs import file_log, show_own_words_only
 from service.machine.executors import computing_at
 from service.machine.resources import compute_in_background, keep_freed_memory
 from service.monitor.snapshot import SignOfLife
+from service.store.data_folder import object_store_of
 from service.store.store import Store
-from service.worker.abilities import Abilities
-from service.worker.loop import work
+from service.worker.loop import Abilities, work
 
 if TYPE_CHECKING:
     from service.machine.schedulers import Scheduler
@@ -242,3 +246,78 @@ def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_POLL_S)
     _kill(os.getpid())
+
+
+# --- the uploader beside the worker: a process of its own, so that nothing of the network reaches the worker's ----
+
+_UPLOADER_POLL_S = 1.0
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 2.0, 60.0
+_GRACE_S = 5.0
+
+
+@contextmanager
+def uploading(data: Path) -> Generator[None]:
+    """Keep an uploader at work meanwhile, if the data folder's site.yaml names an object store; else nothing begins.
+
+    A site.yaml that is wrong, or a package that is missing, is logged: the worker goes on without it.
+    """
+    if not _names_store(data):
+        yield
+        return
+    over = threading.Event()
+    keeper = threading.Thread(target=_keep, args=(data, over), name="uploader", daemon=True)
+    keeper.start()
+    try:
+        yield
+    finally:
+        over.set()
+        keeper.join()
+
+
+def _names_store(data: Path) -> bool:
+    try:
+        section = object_store_of(data)
+        if section is None:
+            return False
+        from service.store.objects.opening import open_objects  # noqa: PLC0415 - for sites only
+
+        open_objects(data, section)
+    except ConfigurationError as error:
+        _log.error("nothing is uploaded: %s", error)
+        return False
+    return True
+
+
+def _keep(data: Path, over: threading.Event) -> None:
+    """Start the uploader again whenever it ends, until `over`; then end it."""
+    arguments = ["store", "upload", "--follow", "--data", str(data), "--json", "--parent", str(os.getpid())]
+    wait_s = _FIRST_WAIT_S
+    while not over.is_set():
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "service.cli.main", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except OSError as error:  # for want of memory, say
+            _log.warning("no uploader could be started: %s", error.strerror)
+            over.wait(wait_s)
+            continue
+        while process.poll() is None and not over.wait(_UPLOADER_POLL_S):
+            pass
+        if over.is_set():
+            _end(process)
+            return
+        _log.warning("the uploader has ended (status %s); another one is started", process.returncode)
+        over.wait(wait_s)
+        wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_GRACE_S)
+    except subprocess.TimeoutExpired:  # it waits for the network
+        process.kill()
+        process.wait()

@@ -24,7 +24,7 @@ from service.core.recovery import NEEDS_A_PERSON, REMEDIES, WayOn, takes_words, 
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.core.step_params import StepParams
-from service.runner.operator import AnswerBy
+from service.runner.held_run import AnswerBy
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome
 from service.steps.measures import Count, MeasureRecord

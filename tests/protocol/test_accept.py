@@ -27,7 +27,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.sessions import People
-from service.runner.operator import AnswerBy
+from service.runner.held_run import AnswerBy
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.pages.web import WebSite, password_of

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import PedalReading
 from service.core.run.decide import AskOperator
-from service.runner.pedal import Pedal
+from service.runner.leave import Pedal
 
 QUESTION = AskOperator("fixation", "confirm", "Go on?", (), ("confirm", "skip"))
 OTHER = AskOperator("capture", "confirm", "Move?", (), ("confirm",))

@@ -22,7 +22,7 @@ from service.core.run.fold import fold
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
 from service.runner import loop as runner_loop
-from service.runner.software import software_versions
+from service.runner.held_run import software_versions
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
 from service.store.signatures.second_place import SecondPlace

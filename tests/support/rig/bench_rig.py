@@ -39,7 +39,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import HandWork, RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
-from service.runner.operator import AnswerBy
+from service.runner.held_run import AnswerBy
 from service.steps.context import ConnectionEnd, FurtherCamera, LeaveToMove, StationLayout
 from service.store.durable_effects import Clock, SystemClock
 from tests.support.rig.bench_lightbox import BenchLightbox

@@ -26,7 +26,7 @@ from service.core.records.run_events import (
 )
 from service.rig import load_rig
 from service.run_start import start_run
-from service.runner.software import software_versions
+from service.runner.held_run import software_versions
 from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint

@@ -14,7 +14,7 @@ from service.core.records.run_events import OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
-from service.runner.operator import AnswerBy
+from service.runner.held_run import AnswerBy
 from tests.support.rig.bench_rig import ScriptedOperator, agree, answer
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
