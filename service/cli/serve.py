@@ -19,7 +19,6 @@ from typing import Annotated
 
 import typer
 
-from service.audit.starts import record_start
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -48,7 +47,7 @@ from service.store.store import Store
 from service.web.app import create_app
 from service.web.connections import ConnectionLimits, affordable_connections
 from service.web.server import known_proxies, listening, server, sparing_log, told
-from service.web.site import Launcher, Site
+from service.web.site import Launcher, Site, record_start
 
 _PROTOCOLS = shipped_protocols()
 _SERVED = "serving.json"  # in the data folder, locked while a server uses it

@@ -118,7 +118,7 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Callable
     with bench_store(tmp_path / "data") as store:
 
         def begun(fakes: Fakes, walker: Walker) -> Bench:
-            monkeypatch.setattr("service.runner.execution.step_kinds", fakes.kinds)
+            monkeypatch.setattr("service.runner.loop.step_kinds", fakes.kinds)
             bench = begin_run(store, PROTOCOL, tmp_path)
             bench.operator = walker
             return bench

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from service.audit import starts
-from service.audit.starts import record_start
 from service.core.errors import ConfigurationError
 from service.core.records.events import ServiceStarted
 from service.core.records.run_events import RunAborted
@@ -17,6 +15,8 @@ from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from service.web import site
+from service.web.site import record_start
 from tests.support.record.outsider import tamper
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run
@@ -59,12 +59,12 @@ def protocol(tmp_path: Path) -> Path:
 def test_differences_since_the_last_start_are_told(
     store: Store, rig: Rig, protocol: Path, clock: Clocks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(starts, "software_versions", lambda: {"a": "1", "b": "1"})
+    monkeypatch.setattr(site, "software_versions", lambda: {"a": "1", "b": "1"})
     first = record_start(store, rig, [protocol], "http://127.0.0.1:8000")
     assert (first.changed, first.clock_jump_s) == ({}, None)
     assert first.configuration.keys() == {str(rig.path), str(protocol)}
     clock.passed_s = 100.0
-    monkeypatch.setattr(starts, "software_versions", lambda: {"a": "2", "c": "1"})
+    monkeypatch.setattr(site, "software_versions", lambda: {"a": "2", "c": "1"})
     protocol.write_text("id: other\n")
     second = record_start(store, rig, [protocol], "http://127.0.0.1:8000")
     assert second.changed == {

@@ -13,8 +13,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
-from service.runner.execution import Starvation
-from service.runner.loop import Runner
+from service.runner.loop import Runner, Starvation
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
 from service.store.signatures.second_place import SecondPlace

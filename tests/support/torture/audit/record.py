@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from service.audit.findings import correct
-from service.audit.starts import record_start
 from service.core.errors import DataError
 from service.core.records.run_events import EvidenceExported, OperatorAction, RunAborted, RunReleased
 from service.people.control import Control
@@ -27,6 +26,7 @@ from service.store.signatures.second_place import SecondPlace, journal_copy
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
+from service.web.site import record_start
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
 from tests.support.record.time_stamp_authority import time_stamp_authority
 from tests.support.runs.bench_run import PROTOCOL, begin_run
