@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from importlib.resources import files
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -280,3 +281,11 @@ def protocol_file(named: Path) -> Path:
             remedy=f"Check the path, or name one of {', '.join(path.stem for path in shipped.values())}",
         )
     return found
+
+
+def only_here(host: str) -> bool:
+    """Return whether an address to listen on is reached from this machine alone."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

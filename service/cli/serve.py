@@ -13,7 +13,6 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from io import FileIO
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +24,7 @@ from service.cli.common import (
     JsonOption,
     console,
     error_console,
+    only_here,
     print_json,
     reporting_errors,
     shipped_protocols,
@@ -113,7 +113,7 @@ def serve_command(
     """Serve the guided screen and the audit. Runs continue when this command ends; stop them on the screen."""
     with reporting_errors(json):
         tls = _tls(tls_certificate, tls_key)
-        lan = _leaves_this_machine(host)
+        lan = not only_here(host)
         if lan and tls is None and not insecure_lan:
             raise _unprotected(host)
         rig_file = load_rig(rig)
@@ -254,13 +254,6 @@ def _tls(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None
         if not path.is_file():
             raise ConfigurationError("the TLS file does not exist", where=str(path))
     return certificate, key
-
-
-def _leaves_this_machine(host: str) -> bool:
-    try:
-        return not ip_address(host).is_loopback
-    except ValueError:
-        return host != "localhost"
 
 
 def _names(host: str, more: list[str]) -> tuple[str, ...]:

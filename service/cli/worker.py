@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import signal
 import threading
@@ -16,6 +15,7 @@ from service.cli.common import (
     DataOption,
     JsonOption,
     console,
+    only_here,
     print_json,
     progress_bar,
     reporting_errors,
@@ -141,7 +141,7 @@ def dicom_listen_command(
     from drivers.dicom_receiver import Receiver, ReceiverConfig  # noqa: PLC0415 - pydicom, which a worker does without
 
     with reporting_errors(json):
-        if not _only_here(host) and not callers:
+        if not only_here(host) and not callers:
             raise ConfigurationError(
                 f"{host} is reachable from other machines, and any caller may send",
                 where="--host",
@@ -166,12 +166,3 @@ def dicom_listen_command(
             else:
                 console.print(f"Listening as {ae_title} on {host}:{receiver.port}; series go to {folder}")
             stopped.wait()
-
-
-def _only_here(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
