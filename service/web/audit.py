@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from threading import Lock
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -37,11 +36,10 @@ from service.web.run_actions import Reason
 from service.web.run_frame import sentence
 from service.web.run_view_records import GateLine, gate_lines
 from service.web.security import SignedInPerson, requires
-from service.web.site import CurrentSite, Site
+from service.web.site import Site, singleton
 
 # --- shared by the auditor's pages: background computations, the frame of a run's pages, query fields -------------
 
-_LOCK = Lock()
 _TABS = (
     ("", "Overview"),
     ("/gates", "Gates"),
@@ -65,15 +63,8 @@ class AuditState:
     verifications: Verifications
 
 
-def _audit(request: Request, site: CurrentSite) -> AuditState:
-    state = request.app.state
-    with _LOCK:
-        if not hasattr(state, "audit"):
-            state.audit = AuditState(
-                site, digests(site.store), graphs(site.store), Verifications(site.data, site.store.clock)
-            )
-        found: AuditState = state.audit
-    return found
+def _audit_of(site: Site) -> AuditState:
+    return AuditState(site, digests(site.store), graphs(site.store), Verifications(site.data, site.store.clock))
 
 
 def close_audit(app: FastAPI) -> None:
@@ -84,7 +75,7 @@ def close_audit(app: FastAPI) -> None:
         found.graphs.close()
 
 
-CurrentAudit = Annotated[AuditState, Depends(_audit)]
+CurrentAudit = Annotated[AuditState, Depends(singleton("audit", _audit_of))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from threading import Lock
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Request, Response
@@ -21,7 +20,7 @@ from service.run_acts import release_run, require_releasable
 from service.web.audit import AuditFrame, CurrentAudit, audit_frame
 from service.web.rendering import render
 from service.web.security import SignedInPerson, requires
-from service.web.site import CurrentSite, RunId
+from service.web.site import CurrentSite, RunId, singleton
 
 router = APIRouter(tags=["exports"])
 
@@ -30,29 +29,10 @@ _REPORT = [Depends(requires("report"))]
 _EXPORT = [Depends(requires("export"))]
 _REPORTS: tuple[What, ...] = ("report", "report_pdf")  # which say that a run is not released yet
 _LISTING_S, _STOPPING_S = 30.0, 5.0  # how long a press of a button may wait for it
-_LOCK = Lock()
 
 
-def _exports(request: Request, site: CurrentSite) -> Exports:
-    state = request.app.state
-    with _LOCK:
-        if not hasattr(state, "exports"):
-            state.exports = Exports(site.data, site.store.clock)
-        found: Exports = state.exports
-    return found
-
-
-def _formats(request: Request, site: CurrentSite) -> Formats:
-    state = request.app.state
-    with _LOCK:
-        if not hasattr(state, "formats"):
-            state.formats = Formats(site.store.clock)
-        found: Formats = state.formats
-    return found
-
-
-CurrentExports = Annotated[Exports, Depends(_exports)]
-CurrentFormats = Annotated[Formats, Depends(_formats)]
+CurrentExports = Annotated[Exports, Depends(singleton("exports", lambda site: Exports(site.data, site.store.clock)))]
+CurrentFormats = Annotated[Formats, Depends(singleton("formats", lambda site: Formats(site.store.clock)))]
 
 
 @router.get("/runs/{run_id}/exports", name="exports", dependencies=_READ, response_class=HTMLResponse)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
@@ -26,7 +25,7 @@ from service.web.rendering import render
 from service.web.run_frame import run_frame
 from service.web.scene import FRAME_HEADERS, Theme
 from service.web.security import requires
-from service.web.site import CurrentSite, RunId
+from service.web.site import CurrentSite, RunId, singleton
 
 FOLDER = "benchmark"
 
@@ -70,7 +69,6 @@ def benchmark_of(data: Path, events: Sequence[Event]) -> Benchmark:
 
 
 _VERSION = "3"  # of what a preview holds
-_LOCK = Lock()
 
 
 class Previews:
@@ -110,16 +108,9 @@ class Previews:
         return self._data / "cache" / "dataset" / f"{state.run_id}-{state.completed_sha256[:16]}-{_VERSION}"
 
 
-def _previews(request: Request, site: CurrentSite) -> Previews:
-    state = request.app.state
-    with _LOCK:
-        if not hasattr(state, "previews"):
-            state.previews = Previews(site.data, site.store.clock)
-        found: Previews = state.previews
-    return found
-
-
-CurrentPreviews = Annotated[Previews, Depends(_previews)]
+CurrentPreviews = Annotated[
+    Previews, Depends(singleton("previews", lambda site: Previews(site.data, site.store.clock)))
+]
 
 
 SPLITS = ("dense", "sparse", "train", "test")

@@ -29,6 +29,7 @@ from service.core.measure_names import measure_name
 from service.core.protocol import LoadedProtocol, Protocol, irreversible_warning, load_protocol
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.core.run.state import lost_arms
+from service.monitor.snapshot import read_snapshot
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.disk_space import forecast_of
@@ -164,9 +165,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
     except OrthocaptureError as error:
         return _unreadable(row, str(error))
     state = log.state
-    # Imported here: one small file a run is read for those under way only.
-    from service.monitor.snapshot import read_snapshot  # noqa: PLC0415
-
+    # One small file a run is read, for those under way only.
     robot, standing, why = "", ("", ""), ""
     if not state.terminal or lost_arms(state):  # an arm that nobody has looked at outlasts its run
         now_utc_s = site.store.clock.utc_s()

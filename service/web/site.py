@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
@@ -174,6 +174,23 @@ def _site(request: Request) -> Site:
 
 
 CurrentSite = Annotated[Site, Depends(_site)]
+_Made = TypeVar("_Made")
+_MAKING = Lock()
+
+
+def singleton(name: str, make: Callable[[Site], _Made]) -> Callable[[Request], _Made]:
+    """Return a dependency of pages: what is made for an application at its first use and stays in its state."""
+
+    def instance(request: Request) -> _Made:
+        state = request.app.state
+        with _MAKING:
+            if not hasattr(state, name):
+                setattr(state, name, make(state.site))
+            return cast(_Made, getattr(state, name))
+
+    return instance
+
+
 RunId = Annotated[str, UrlPath(max_length=64)]
 
 
