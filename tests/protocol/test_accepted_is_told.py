@@ -49,7 +49,7 @@ def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> No
     assert described["accepted_gates"] == [f"Evaluate: Mean radial error of the registration used {text}"]
     with Store.open(data) as store:
         bundle = export_bundle(store, run_id, folder / "bundle.zip", actor="Emmy", hashes_only=True).path
-    verifier = ROOT / "service" / "audit" / "verify" / "bundle_verifier.py"
+    verifier = ROOT / "service" / "audit" / "bundle_verifier.py"
     done = subprocess.run([sys.executable, verifier, bundle], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "evaluation counts as passed with figures outside their limits, as Emmy (supervisor)" in done.stdout

@@ -114,5 +114,5 @@ def places() -> set[str]:
     """The files that look at UTC, at the time of a file or at that of the boot."""
     sources = [path for top in ("service", "drivers") for path in (REPOSITORY / top).rglob("*.py")]
     found = [path for path in sources if _LOOKS.search(path.read_text())]
-    own = REPOSITORY / "service" / "audit" / "verify" / "bundle_verifier.py"  # of a bundle, far from every host
+    own = REPOSITORY / "service" / "audit" / "bundle_verifier.py"  # of a bundle, far from every host
     return {str(path.relative_to(REPOSITORY)) for path in found if path != own}
