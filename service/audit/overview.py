@@ -1,4 +1,4 @@
-"""The first page of an audit: a run's digest, folded in the background, its deviations, and the list of runs."""
+"""A run's digest, folded in the background: its photographs, deviations and gates, and the list of runs."""
 
 from __future__ import annotations
 

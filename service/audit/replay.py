@@ -1,4 +1,4 @@
-"""Replay: recorded jobs are computed again from the recorded files and arguments, and compared with the record."""
+"""Replay: recorded jobs computed and gates judged again from the record, with drift and changed software named."""
 
 from __future__ import annotations
 

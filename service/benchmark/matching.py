@@ -246,7 +246,7 @@ Epipolar: median over the pairs of the median distance from the epipolar lines."
 
 
 def rows(results: Sequence[MethodResult]) -> list[tuple[str, ...]]:
-    """Return the rows below HEADER: each method on each class of pairs."""
+    """Return the table's rows, of the columns HEADER: one for each method and each difficulty of pairs."""
     return [(result.method, *_cells(one)) for result in results for one in result.classes]
 
 

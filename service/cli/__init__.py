@@ -1,1 +1,1 @@
-"""The command line: the only place that prints, prompts or exits."""
+"""The command line: prompts, prints and exits; no other room does, but programs that it starts and reads."""

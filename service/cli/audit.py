@@ -1,4 +1,4 @@
-"""`orthocapture audit`: show the evidence of a run, verify it, release it, correct it, and report on it."""
+"""`orthocapture audit`: show, verify, correct, release, report and export evidence, and manage signing keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`orthocapture calibrate`: intrinsics, and the camera's pose on the robot's flange, from images of a board."""
+"""`orthocapture calibrate`: the group, and `hand-eye`, the camera's pose on the robot's flange."""
 
 from __future__ import annotations
 

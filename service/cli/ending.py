@@ -10,7 +10,7 @@ from enum import IntEnum
 
 from service.core.errors import OrthocaptureError, PersonNeededError
 
-# --- exit statuses: one table, and the one place that decides which an error has ----------------------------------
+# --- exit statuses: one table, and which of them an error has ----------------------------------
 
 
 class ExitStatus(IntEnum):

@@ -1,4 +1,4 @@
-"""Answers a run's questions: a person at the terminal, people at screens, an import's list, or automation."""
+"""Who answers a run's questions: people, an import's list, automation, a simulated technician; and their display."""
 
 from __future__ import annotations
 

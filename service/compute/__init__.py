@@ -1,1 +1,1 @@
-"""Numerics on arrays and frozen dataclasses: detection, calibration, registration, evaluation."""
+"""Numerics on arrays, and the images, meshes and poses they begin with: calibration, registration, evaluation."""

@@ -1,1 +1,1 @@
-"""Pure core: records, lifecycle, decisions, recovery, geometry. No input or output here."""
+"""Pure core: records, lifecycle, decisions, recovery, geometry, and checks of the files that come in."""

@@ -1,4 +1,4 @@
-"""The imperative loop: decide, act, append. Only this package executes decisions and drives hardware."""
+"""Drives a run: the execution of a step on the rig's devices, and the loop that decides, acts and appends."""
 
 from __future__ import annotations
 

@@ -171,9 +171,9 @@ def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) 
             Path(folder.name),
             lambda camera, inside: expose_when_free(context, camera, inside, was_busy=was_busy),
         )
-        for one in further:
-            if one.rigid:  # it moved if the arm did
-                window += _during(exposure.robot, one.image, one.wanted)
+        for camera in further:
+            if camera.rigid:  # it moved if the arm did
+                window += _during(exposure.robot, camera.image, camera.wanted)
         pose = exposure_pose(window)
     except BaseException:
         folder.cleanup()

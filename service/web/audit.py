@@ -1,4 +1,4 @@
-"""The auditor's pages of a run: gates, devices, corrections, signatures, verification, events and files."""
+"""The auditor's pages of a run and of the site: gates, corrections, verification, events, files, provenance."""
 
 from __future__ import annotations
 

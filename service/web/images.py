@@ -1,4 +1,4 @@
-"""Finds a run's images, which is valid, replaced or used and what was found in it, and makes small copies."""
+"""A run's images: valid, replaced or used, what was found in them, and small copies with outlines drawn."""
 
 from __future__ import annotations
 

@@ -193,9 +193,9 @@ def calibrate_hand_eye(
 ) -> HandEyeResult:
     """Solve T_base_flange · T_flange_camera · T_camera_board = T_base_board over the views.
 
-    `weighted`, the default, weights robot and images by the noise that the data show in each (weighted.py). A closed
-    form uses no weights, and `reprojection` attributes the robot's errors to the images. Given joints and the arm's
-    model, the weighted fit also estimates the arm's systematic error and keeps it if held-out views improve.
+    `weighted`, the default, weights robot and images by the noise that the data show in each (reprojection.py). A
+    closed form uses no weights, and `reprojection` attributes the robot's errors to the images. Given joints and the
+    arm's model, the weighted fit also estimates the arm's systematic error and keeps it if held-out views improve.
 
     Args:
         views: the measurements.

@@ -1,4 +1,4 @@
-"""Checks whether robot poses and board images fit together, and names the usual mistake if they do not."""
+"""Finds a first hand-eye answer by closed forms, and names the usual mistake if poses and images do not fit."""
 
 from __future__ import annotations
 

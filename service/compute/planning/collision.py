@@ -142,7 +142,7 @@ def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
 
 
 def segment_box_distance_m(p0: Array, p1: Array, half_extent_m: Array) -> Array:
-    """Return least distances (...,) of segments p0–p1 (..., 3) to a box of ± half extents (3,) at 0; 0 inside.
+    """Return the least distances (...,) of segments p0–p1 (..., 3) to a box around the origin; 0 for one within it.
 
     The distance to a convex body is convex along a segment, so ternary search finds its minimum, to a micrometre on
     segments of a metre.

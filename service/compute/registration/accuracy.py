@@ -1,4 +1,4 @@
-"""Accuracy of a registration: the paper's two errors on control spheres, the true error, and the error budget."""
+"""Accuracy of a registration: the paper's two errors, constellations compared, the true error, the error budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Holds what structure from motion is given, features and verified matches, and builds tracks of them."""
+"""Features and verified matches of images: found, packed, joined into tracks, and triangulated."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ class HybridPoses:
 
     @property
     def scan_covariance(self) -> Array:
-        """(6, 6) of T_world_scan; zero if the world is the scan frame."""
+        """Return the covariance (6, 6) of T_world_scan; it is zero if the world is the scan frame."""
         return self.joint_world_covariance()[-6:, -6:]
 
     def sigma_at_m(self, point_scan_m: Array) -> float:

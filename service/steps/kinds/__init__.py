@@ -1,1 +1,1 @@
-"""Step kinds: one file for each, with its Params, Measures, Result, execute() and KIND, in any folder here."""
+"""Step kinds: one file for each, with its Params, Measures, Result, execute() and KIND, or those of its parts."""
