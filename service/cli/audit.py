@@ -54,7 +54,7 @@ from service.store.records import Artefact
 from service.store.runs import resolve_run
 from service.store.signatures.signing import PublicKey, checkpoint, public_keys, rotate_key, sign_here
 from service.store.store import Store
-from service.store.verification import verify as audit
+from service.store.verification import verify as verification
 from service.store.verification.verify import AuditReport, EvidenceRecord
 
 # --- `report` and `figures`: a report of a run, or its figures, for readers outside -------------------------------
@@ -88,10 +88,10 @@ def report_command(
         for path in (pdf, html):
             if path is not None:
                 require_writable(path)
-        run_id = resolve_run(audit.list_runs(data), run)
+        run_id = resolve_run(verification.list_runs(data), run)
         actor = acting_name(data, operator, "report", password_stdin=password_stdin) if _writable(data) else ""
         with progress_bar(quiet=json) as progress:
-            verified = audit.verify(data, run_id, progress).with_limits()
+            verified = verification.verify(data, run_id, progress).with_limits()
             # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
             from service.audit.recorded_run import read_run  # noqa: PLC0415
             from service.audit.report import report_content  # noqa: PLC0415
@@ -169,9 +169,9 @@ def figures_command(
     """
     with reporting_errors(json):
         require_writable_folder(out)
-        run_id = resolve_run(audit.list_runs(data), run)
+        run_id = resolve_run(verification.list_runs(data), run)
         with progress_bar(quiet=json) as progress:
-            verified = audit.verify(data, run_id, progress).with_limits()
+            verified = verification.verify(data, run_id, progress).with_limits()
             if not verified.ok:
                 error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
                 raise typer.Exit(ExitStatus.FAILED)
@@ -264,7 +264,7 @@ def correct_command(
 
 def _require_verified(store: Store, run_id: str, *, quiet: bool) -> None:
     with progress_bar(quiet=quiet) as progress:
-        found = audit.verify(store.database_path.parent, run_id, progress)
+        found = verification.verify(store.database_path.parent, run_id, progress)
     if found.first_fault is not None:
         raise IntegrityError(
             f"the evidence does not verify: {found.first_fault}", where=run_id, remedy="Nothing is released"
@@ -306,8 +306,8 @@ def show_command(
 ) -> None:
     """List everything that was recorded: what happened, when, who did it, and the files."""
     with reporting_errors(json):
-        run_id = resolve_run(audit.list_runs(data), run)
-        records = audit.show(data, run_id)
+        run_id = resolve_run(verification.list_runs(data), run)
+        records = verification.show(data, run_id)
         if json:
             print_json({"run": run_id, "events": [_record_json(record) for record in records]})
         else:
@@ -344,10 +344,10 @@ def verify_command(
     while the object store is away.
     """
     with reporting_errors(json):
-        run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
+        run_id = None if run == "all" else resolve_run(verification.list_runs(data), run)
         with progress_bar(quiet=json) as report_progress:
             begun_s = time.monotonic()
-            report = audit.verify(
+            report = verification.verify(
                 data,
                 run_id,
                 report_progress,

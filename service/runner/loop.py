@@ -69,7 +69,7 @@ from service.store.store import Store
 
 # --- the execution of a step --------------------------------------------------------------------------------------
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 _NOBODY_S = 30.0  # a worker that died has been replaced by then
 _TOLD_AGAIN_S = 300.0
 _EVERY_S = 5.0
@@ -162,7 +162,7 @@ class StepExecution:
         except OrthocaptureError as error:
             self.failed(step_id, attempt, error, starvation)
         except Exception as error:  # noqa: BLE001 - of a library, over a stranger's file, say
-            _LOG.info("%s", step_id, exc_info=True)  # below what the terminal shows
+            _log.info("%s", step_id, exc_info=True)  # below what the terminal shows
             if step.moves_robot:
                 self.devices.hold_arms()
             self.failed(step_id, attempt, _unforeseen(step, error), starvation)

@@ -43,7 +43,7 @@ from service.store.objects.reading import SpoolReader
 from service.store.signatures.checkpoints import KeyFolder, read_every_checkpoint
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
-from service.store.verification import verify as audit
+from service.store.verification import verify as verification
 
 MARKER = "orthocapture-backup.json"
 STATES = "states"
@@ -314,7 +314,7 @@ class _Backup:
         lost = self._copy_files(missing, holds.sizes)
         if self.options.with_keys:
             self._copy_keys(part)
-        checked = audit.verify(part, files=False)
+        checked = verification.verify(part, files=False)
         state = BackupState(
             at_utc=self.at_utc,
             host=socket.gethostname(),

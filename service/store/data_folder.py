@@ -58,7 +58,7 @@ def object_store_of(data_dir: Path) -> ObjectStoreSection | None:
 KEYS = "keys"  # the folder that is never shared
 PEPPER = "pepper"  # within it, the key to which hashes of PINs and badges are bound
 _FILES = "artefacts"  # the folder of the files
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 _SHARED_MODE = stat.S_ISGID | stat.S_IRWXG
 _ACCESS_REMEDY = (
     "Run this as that account. To share the folder with a group, its owner gives `chgrp GROUP DIR` and "
@@ -156,7 +156,7 @@ def close_to_others(folder: Path, database: str) -> None:
     with suppress(OSError):
         folder.chmod(wanted)  # first of all: nobody else reaches what lies within any more
     if stat.S_IMODE(folder.stat().st_mode) != wanted:
-        _LOG.warning("%s cannot be closed to other accounts of this machine: its file system keeps no rights", folder)
+        _log.warning("%s cannot be closed to other accounts of this machine: its file system keeps no rights", folder)
         return
     changed = sum(_close(path, kept, before.st_gid) for path in _within(folder))
     if changed:
@@ -166,7 +166,7 @@ def close_to_others(folder: Path, database: str) -> None:
             else ("; until now other accounts of this machine could read it, the hashes of PINs included")
         )
         whose = f"its owner and the group {before.st_gid}" if shared else "its owner"
-        _LOG.warning("%s and what it holds are for %s alone now%s", folder, whose, before_that)
+        _log.warning("%s and what it holds are for %s alone now%s", folder, whose, before_that)
 
 
 def _differs(database: Path, kept: int, group: int) -> bool:

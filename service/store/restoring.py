@@ -31,7 +31,7 @@ from service.store.records import SITE
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
-from service.store.verification import verify as audit
+from service.store.verification import verify as verification
 from service.store.verification.file_checks import Survey, committed_rows, journal_findings, survey
 from service.store.verification.verify import AuditReport
 
@@ -102,7 +102,7 @@ def restore(
             shutil.rmtree(work)
             raise
         lost = _copy_files(source, work, files, progress)
-        report = audit.verify(work, progress=progress)
+        report = verification.verify(work, progress=progress)
         restored = DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host)
         _let_go(work, restored, name_of_actor)
         for part in (

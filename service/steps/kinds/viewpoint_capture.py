@@ -110,7 +110,7 @@ class _Capture:
         self._nominal = context.devices.nominal_T_flange_camera()
         done = taken_for_good(context.evidence.captures(context.step.id), again)
         self._features = EarlyFeatures.begin(context, plan)
-        self.plan = self._planned([v for v in plan if v.name not in done])
+        self.plan = self._plan([v for v in plan if v.name not in done])
         self.viewpoints = [*self.plan.viewpoints, *(v for v in plan if v.name in done)]
 
     @cached_property
@@ -118,7 +118,7 @@ class _Capture:
         """Further viewpoints of the last set, which only the analysis of the images may ask for."""
         return denser_viewpoints(self.last, self._context.devices.layout(self.last.station))
 
-    def _planned(self, viewpoints: Sequence[Viewpoint]) -> StepPlan:
+    def _plan(self, viewpoints: Sequence[Viewpoint]) -> StepPlan:
         """Plan the motions from where the arms stand."""
         return plan_step(self._context, viewpoints, self._nominal, self._order)
 
@@ -160,7 +160,7 @@ class _Capture:
             for sha256, viewpoint in due.items():
                 self._context.tell(f"{viewpoint}: {spoilt[sha256]}; it is taken again")
             repeated |= set(due.values())
-            totals = replace(self.take(self._planned(self.of_images(due)), due), given_up=totals.given_up)
+            totals = replace(self.take(self._plan(self.of_images(due)), due), given_up=totals.given_up)
         live.note_spoilt(spoilt)
         return totals, spoilt
 

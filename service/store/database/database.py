@@ -144,7 +144,7 @@ def _sqlite_triggers(table: str, key: str) -> tuple[str, ...]:
     )
 
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 Channel = Literal["chains", "jobs"]
 _NOTIFY = text("SELECT pg_notify(:channel, :run)")
 
@@ -198,7 +198,7 @@ class HeardChanges(Changes):
             for _ in session.notifies(timeout=seconds, stop_after=1):
                 pass
         except (SQLAlchemyError, OSError, self._driver_error()) as error:
-            _LOG.warning("changes of the database are not heard but polled for: %s", error)
+            _log.warning("changes of the database are not heard but polled for: %s", error)
             self.close()
             self._clock.sleep(seconds)
 

@@ -47,7 +47,7 @@ from service.store.records import RecordDamagedError, StoreVersionError
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 RESTORE = (
     "`orthocapture store rebuild` restores a damaged database from its journal; or restore the folder from a copy"
 )
@@ -281,7 +281,7 @@ class SqliteDatabase(Database):
                 waited_s = time.monotonic() - began_s
                 if not _is_busy(error) or waited_s >= self._patience_s:
                     raise
-                _LOG.warning("another process has held %s for %.0f s; waiting for it", self._path, waited_s)
+                _log.warning("another process has held %s for %.0f s; waiting for it", self._path, waited_s)
 
     def require_in_place(self) -> None:
         """Raise StoreError unless the database and its write-ahead log are still the files that were opened.

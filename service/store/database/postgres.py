@@ -111,7 +111,7 @@ def _quoted(role: str) -> str:
     return '"' + role.replace("%", "%%").replace('"', '""') + '"'
 
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 WRITERS = 0x6F727468  # the advisory lock that writers hold; any number that nobody else uses
 LOCK_TIMEOUT_S = 30  # of one wait for another writer; then a warning is logged
 _HUNG_S = 120  # a client that does nothing within a transaction for so long loses it, so that a site goes on
@@ -212,7 +212,7 @@ class PostgresDatabase(Database):
                 waited_s = time.monotonic() - began_s
                 if getattr(error.orig, "sqlstate", "") != _LOCK_NOT_AVAILABLE or waited_s >= self._patience_s:
                     raise
-                _LOG.warning("another process has held %s for %.0f s; waiting for it", self.where, waited_s)
+                _log.warning("another process has held %s for %.0f s; waiting for it", self.where, waited_s)
             else:
                 return
 

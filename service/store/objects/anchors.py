@@ -301,7 +301,7 @@ def _retention(mode: str, until: str) -> datetime | None:
 # It is beside every capture and signature, and never in their way.
 
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +358,7 @@ class AnchorWriter:
         try:
             with self._log.open("rb") as stream:
                 if stream.seek(0, 2) < self._place.offset:
-                    _LOG.error("the log of signatures is shorter than it was: run `orthocapture audit verify all`")
+                    _log.error("the log of signatures is shorter than it was: run `orthocapture audit verify all`")
                     self._place = _Place()
                 stream.seek(self._place.offset)
                 found = stream.read()

@@ -325,7 +325,7 @@ def _silence(counted: CountedSpool | None, waiting: Waiting, now: datetime) -> U
     return UploadTrouble(since_utc, "no uploader is at work: start `orthocapture worker`")
 
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 _DAY_S = 86_400.0
 
 
@@ -405,7 +405,7 @@ def _free(store: Store, objects: ObjectStore, file: SpoolFile) -> SpoolFile:
         before = path.stat()
         stated = objects.stat(file.sha256)
         if stated is None or (stated.sha256, stated.size_bytes) != (file.sha256, before.st_size):
-            _LOG.error("the object store does not state any more what it confirmed", extra={"sha256": file.sha256})
+            _log.error("the object store does not state any more what it confirmed", extra={"sha256": file.sha256})
             return replace(file, stays="the object store does not state its hash any more")
         at_utc = utc_text(store.clock.utc_now())
         write_confirmed(store, objects.place, [Recorded(file.sha256, file.size_bytes)], at_utc)
@@ -424,5 +424,5 @@ def _free(store: Store, objects: ObjectStore, file: SpoolFile) -> SpoolFile:
             where=str(path),
             remedy="Check the permissions of the data folder; nothing was lost",
         ) from error
-    _LOG.info("freed from the spool; the object store holds it", extra={"sha256": file.sha256})
+    _log.info("freed from the spool; the object store holds it", extra={"sha256": file.sha256})
     return file

@@ -34,7 +34,7 @@ from service.store.objects.spool import (
 )
 from service.store.store import Store
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 _AT_ONCE = 16  # files between two transactions
 _IDLE_S = 5.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
@@ -101,7 +101,7 @@ class Uploader:
                 if why:
                     self.refused[file.sha256] = why
                     self._places[file.sha256] = file.position
-                    _LOG.error("a file is not in the object store: %s", why, extra={"sha256": file.sha256})
+                    _log.error("a file is not in the object store: %s", why, extra={"sha256": file.sha256})
                 else:
                     confirmed.append(file)
                 self._after = max(self._after, file.position - 1)  # the same event may have brought more
@@ -159,7 +159,7 @@ class Uploader:
         except ObjectStoreAwayError:
             raise
         except StoreError as error:
-            _LOG.error("the evidence is not anchored: %s", error.what)
+            _log.error("the evidence is not anchored: %s", error.what)
             return error
         if self._anchors.beyond:
             lines = counted(self._anchors.beyond, "line")
@@ -203,14 +203,14 @@ class Uploader:
                         self.drain(stopped)
                 wait_s, pause_s = _IDLE_S, _FIRST_PAUSE_S
                 if since:
-                    _LOG.info("the object store answers again")
+                    _log.info("the object store answers again")
                     since = ""
                     write_trouble(self._data, None)
             except StoreError as error:
                 if not since:
                     since = utc_text(clock.utc_now())
                     kind = logging.WARNING if isinstance(error, ObjectStoreAwayError) else logging.ERROR
-                    _LOG.log(kind, "nothing is uploaded: %s", error.what)
+                    _log.log(kind, "nothing is uploaded: %s", error.what)
                 write_trouble(self._data, UploadTrouble(since, error.what))
                 wait_s, pause_s = pause_s, min(2 * pause_s, _LONGEST_PAUSE_S)
             if clock.monotonic_s() - refused_s > _AGAIN_S:
