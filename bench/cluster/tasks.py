@@ -42,7 +42,7 @@ from service.dataset.pixels import Photographs, undistorted_data_set
 from service.dataset.records import DataSet, Mesh, PosedView
 from service.machine.executors import computing_at, mapping
 from service.machine.schedulers import Scheduler
-from tests.support.processes.cluster import dask_cluster
+from tests.support.processes.cluster import Cluster, dask_cluster
 from tests.support.processes.cluster_tasks import square
 from tests.support.scenes.slab_data_set import slab_mesh
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
@@ -217,6 +217,20 @@ def full_size_data_set(folder: Path, views: int, faces: int) -> DataSet:
     return data_set(files, full, poses, mesh_of(faces))
 
 
+def grow(cluster: Cluster, workers: int) -> None:
+    """Add workers to a cluster until it has so many, and wait for them."""
+    while len(cluster.workers) < workers:
+        cluster.add_worker()
+    with distributed.Client(cluster.address, set_as_default=False) as client:
+        client.wait_for_workers(workers, timeout=300)
+
+
+def connect(processes: int) -> None:
+    """Have a few tasks computed that take nothing: the connection is made then."""
+    with mapping(processes, 8) as map_over:
+        list(map_over(square, range(8)))
+
+
 def scaling(folder: Path, views: int, width: int, repeats: int, data: DataSet) -> dict[str, dict[str, float]]:
     """Return the wall time of a front end and of the export of `data`, by who computes: medians of turns."""
     files, camera, poses = draw(folder, views, width)
@@ -227,8 +241,7 @@ def scaling(folder: Path, views: int, width: int, repeats: int, data: DataSet) -
         for turn in range(repeats):
             out = folder / f"{name}, {turn}"
             with computing_at(scheduler), tempfile.TemporaryDirectory() as scratch:
-                with mapping(processes, 8) as map_over:
-                    list(map_over(square, range(8)))  # the connection is made
+                connect(processes)
                 begin = time.perf_counter()
                 front_end(files, camera, poses, Path(scratch), processes)
                 middle = time.perf_counter()
@@ -243,10 +256,7 @@ def scaling(folder: Path, views: int, width: int, repeats: int, data: DataSet) -
     own.mkdir()
     with dask_cluster(own, workers=0) as cluster:
         for workers in (1, 2, 4):
-            while len(cluster.workers) < workers:
-                cluster.add_worker()
-            with distributed.Client(cluster.address, set_as_default=False) as client:
-                client.wait_for_workers(workers, timeout=300)
+            grow(cluster, workers)
             name = "Dask, 1 worker" if workers == 1 else f"Dask, {workers} workers"
             compute(name, Scheduler(cluster.address, patience_s=90.0), 2)
     return took

@@ -17,16 +17,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import distributed
-
-from bench.cluster.tasks import full_size_data_set
+from bench.cluster.tasks import connect, full_size_data_set, grow
 from bench.machine import RESULTS, commit, machine
 from bench.registration.register_scale import locate_and_register
 from service.dataset.exporter import exporter, write_data_set
-from service.machine.executors import computing_at, mapping
+from service.machine.executors import computing_at
 from service.machine.schedulers import Scheduler
 from tests.support.processes.cluster import dask_cluster
-from tests.support.processes.cluster_tasks import square
 from tests.support.scenes.rendered_scene import rendered
 
 _SCENE = "scene01_1920_20"
@@ -43,13 +40,9 @@ def measure(folder: Path, views: int, maps: int) -> dict[int, dict[str, float]]:
     own.mkdir()
     with dask_cluster(own, workers=0) as cluster:
         for workers in _WIDTHS:
-            while len(cluster.workers) < workers:
-                cluster.add_worker()
-            with distributed.Client(cluster.address, set_as_default=False) as client:
-                client.wait_for_workers(workers, timeout=300)
+            grow(cluster, workers)
             with computing_at(Scheduler(cluster.address, patience_s=90.0)):
-                with mapping(2, 4 * workers) as map_over:
-                    list(map_over(square, range(4 * workers)))  # the connection is made
+                connect(2)
                 found = locate_and_register(scene, views, 2)
                 begin = time.perf_counter()
                 write_data_set(data, exporter("nerfstudio"), folder / f"out{workers}", processes=2)

@@ -7,7 +7,7 @@ it with `--check`: the list and the marks must agree, and every test must be on 
 The cost of a test is its own, plus its share of each wider fixture that it uses: the fixture's cost over the number
 of tests that use it. Of a parametrised test the dearest row counts. A measurement within a fifth of the limit changes
 no mark, so that marks do not come and go with the machine's mood. Tests marked `whole` are never fast, and are not
-measured. The limit is 0.8 CPU seconds, and one where tests guard people or evidence (`limit_s`).
+measured. The limit is 0.8 CPU seconds, and one where tests guard people or evidence (`limit_of`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tests.support.suite.marks import (
     Costs,
     costs_of,
     disagreements,
-    limit_s,
+    limit_of,
     remarked,
     settled,
     sources,
@@ -44,7 +44,7 @@ def main() -> int:
         kept: Costs = {}
         for file, source in files.items():
             before, now = listed.get(file, {}), measured.get(file, {})
-            names, most_s = [test.name for test in test_functions(source)], limit_s(file)
+            names, most_s = [test.name for test in test_functions(source)], limit_of(file)
             kept[file] = {name: settled(before.get(name), now[name], most_s) for name in names if name in now} | {
                 name: before[name] for name in names if name in before and name not in now
             }

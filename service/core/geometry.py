@@ -109,6 +109,12 @@ def look_at(eye: Array, target: Array, up: Array) -> Transform:
     return transform(np.stack([x, np.cross(z, x), z], axis=1), eye)
 
 
+def rotation_about_z(angle_rad: float) -> Transform:
+    """Return the rotation about the z axis, which is a camera's optical axis."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+
+
 def rotation_angle_rad(T: Transform) -> float:
     """Return the angle of the rotation part in radians, 0 to pi."""
     return float(_rotations().from_matrix(T[:3, :3]).magnitude())

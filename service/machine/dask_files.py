@@ -25,7 +25,7 @@ from uuid import uuid4
 from service.core.errors import DataError
 from service.core.units import megabytes
 from service.machine.executors import this_place
-from service.machine.remote_task import REMEDY, NeededFile, RemoteResult, RemoteTask, compute_there
+from service.machine.remote_task import REMEDY, NeededFile, RemoteResult, RemoteTask, compute_there, stamp_of
 
 if TYPE_CHECKING:
     from _hashlib import HASH
@@ -252,13 +252,13 @@ class _Asking:
                 self._wait_for(key)
             with _news:
                 paths = [_held[key].path for key in keys]
-            before = [_stamp(path) for path in paths]
+            before = [stamp_of(path) for path in paths]
             try:
                 yield paths
             finally:
                 with _news:
                     for key, path, stamp in zip(keys, paths, before, strict=True):
-                        if _stamp(path) != stamp:
+                        if stamp_of(path) != stamp:
                             _held[key].problem = "a task has changed it here"
         finally:
             with _news:
@@ -333,12 +333,3 @@ class _Asking:
                 return
             size_bytes -= _held[key].needed.size_bytes
             _remove(key)
-
-
-def _stamp(file: Path) -> tuple[int, int, int] | None:
-    """Return what differs once a file is changed; None if it is not there."""
-    try:
-        stat = file.stat()
-    except FileNotFoundError:
-        return None
-    return stat.st_size, stat.st_mtime_ns, stat.st_ino

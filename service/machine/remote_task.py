@@ -34,6 +34,7 @@ from service.machine.resources import keep_freed_memory
 _DECIDES = ("compute", "core", "dataset", "machine")  # the rooms of the service whose source decides a task's result
 _LARGEST_BYTES = 1_000_000  # of a task's arguments: larger ones belong into a file
 _MOST_WRITTEN_BYTES = 1_000_000_000  # by a task: a worker holds them twice, and 2 GB are planned for it
+Stamp = tuple[int, int, int]  # size, time of the last change, inode
 REMEDY = (
     "Mount the data folder and the folder for temporary files (TMPDIR) under the same path on every machine of the "
     "cluster; let its workers fetch artefacts from the site's object store; or compute without --scheduler "
@@ -270,7 +271,7 @@ class _Places:
 
     files: dict[str, Path] = field(default_factory=dict[str, Path])  # those with another path here
     folders: dict[str, Path] = field(default_factory=dict[str, Path])
-    sent: dict[str, os.stat_result] = field(default_factory=dict[str, os.stat_result])  # as the files arrived
+    sent: dict[str, Stamp | None] = field(default_factory=dict[str, "Stamp | None"])  # of the files that arrived
 
     @property
     def differ(self) -> bool:
@@ -318,7 +319,7 @@ class _Places:
             if file.is_file()
         ]
         found += [
-            (there, self.files[there]) for there, stat in self.sent.items() if _changed(self.files[there], stat)
+            (there, self.files[there]) for there, stamp in self.sent.items() if stamp_of(self.files[there]) != stamp
         ]
         size_bytes = sum(file.stat().st_size for _, file in found)
         if size_bytes > _MOST_WRITTEN_BYTES:
@@ -331,9 +332,13 @@ class _Places:
         return tuple(WrittenFile(there, file.read_bytes()) for there, file in found)
 
 
-def _changed(file: Path, before: os.stat_result) -> bool:
-    now = file.stat()
-    return (now.st_size, now.st_mtime_ns, now.st_ino) != (before.st_size, before.st_mtime_ns, before.st_ino)
+def stamp_of(file: Path) -> Stamp | None:
+    """Return what differs once a file has been changed; None if it is not there."""
+    try:
+        stat = file.stat()
+    except FileNotFoundError:
+        return None
+    return stat.st_size, stat.st_mtime_ns, stat.st_ino
 
 
 class _CallUnpickler(pickle.Unpickler):
@@ -405,7 +410,7 @@ def _places(files: Sequence[NeededFile], host: str, source: FileSource | None) -
         if asked and source is not None:
             arrived = open_until_done.enter_context(source.provided(asked))
             places.files |= {needed.path: file for needed, file in zip(asked, arrived, strict=True)}
-            places.sent |= {needed.path: file.stat() for needed, file in zip(asked, arrived, strict=True)}
+            places.sent |= {needed.path: stamp_of(file) for needed, file in zip(asked, arrived, strict=True)}
         yield places
 
 

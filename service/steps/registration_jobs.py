@@ -394,27 +394,33 @@ def locate_further_cameras(
         if isinstance(capture, ViewpointCaptured) and all(capture.verdicts.values())
         for exposure in capture.further
     ]
+    if not exposures:
+        return {}
     exposures.sort(key=lambda exposure: exposure[1].device)
+    own = DETECT_SPHERES.read_arguments(search.arguments, jobs_of(context.evidence.state())).set_fields()
+    taken = dict(references_in(search.arguments))
     raw = params.measure_on == "raw"
     requests = {
-        device: _of_camera(context, [*group], search, registered, on_raw=raw)
+        device: _of_camera(context, [*group], own, taken, registered, on_raw=raw)
         for device, group in groupby(exposures, lambda exposure: exposure[1].device)
     }
-    return dict(zip(requests, context.evidence.run_jobs(*requests.values()), strict=True)) if requests else {}
+    return dict(zip(requests, context.evidence.run_jobs(*requests.values()), strict=True))
 
 
 def _of_camera(
     context: StepContext,
     exposures: Sequence[tuple[str, FurtherExposure]],
-    search: JobRequest,
+    own: Mapping[str, Any],
+    taken: Mapping[str, Reference | Each],
     registered: Mapping[str, JobState],
     *,
     on_raw: bool,
 ) -> JobRequest:
-    """Return the job for one camera; its newest calibration counts."""
+    """Return the job for one camera; its newest calibration counts.
+
+    `own`, `taken`: the arguments of the search for spheres by field, and those that are references.
+    """
     last = exposures[-1][1]
-    own = DETECT_SPHERES.read_arguments(search.arguments, jobs_of(context.evidence.state())).set_fields()
-    taken = dict(references_in(search.arguments))
     references: References = {name: taken[name] for name in _SPHERES if name in taken}
     known = {name: own[name] for name in _SPHERES if name in own}
     raws = [exposure_of(viewpoint, exposure.artefacts) for viewpoint, exposure in exposures]

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from service.compute.photography import ViewRange
 from service.core.errors import OrthocaptureError
-from service.core.geometry import Array, Transform, inverse, look_at, transform
+from service.core.geometry import Array, Transform, inverse, look_at, rotation_about_z
 from service.core.records.base import Record
 from service.steps.context import StationLayout
 
@@ -109,7 +109,7 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
             aim = centre + viewpoint_set.aim_spread_m * _spread(i, approach, side)
             roll = np.deg2rad(viewpoint_set.rolls_deg[i % len(viewpoint_set.rolls_deg)])
             top = _UP if viewpoint_set.image_top == "up" else -approach
-            T_base_camera = look_at(eye, aim, top) @ _rotation_about_axis(roll)
+            T_base_camera = look_at(eye, aim, top) @ rotation_about_z(roll)
             viewpoints.append(Viewpoint(viewpoint_name(viewpoint_set.prefix, i), layout.name, T_base_camera))
     if not viewpoints:
         raise NoViewpointError(
@@ -149,11 +149,6 @@ def _spread(i: int, approach: Array, side: Array) -> Array:
     u = (0.5 + 0.7548776662466927 * (i + 1)) % 1.0
     v = (0.5 + 0.5698402909980532 * (i + 1)) % 1.0
     return (2 * u - 1) * side + (2 * v - 1) * approach
-
-
-def _rotation_about_axis(angle_rad: float) -> Transform:
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
 
 # --- poses before the calibration board ----------------------------------------------------------------------------

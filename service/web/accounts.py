@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from typing import Annotated, cast
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
@@ -76,11 +78,7 @@ def change_role(
     reason: Reason,
 ) -> Response:
     """Give an account another role."""
-    try:
-        site.people.accounts.change_role(person, account, role, reason)
-    except AccountError as error:
-        return _refused(request, site, account, error)
-    return _back(account)
+    return _after(request, site, account, partial(site.people.accounts.change_role, person, account, role, reason))
 
 
 @router.post(
@@ -94,11 +92,7 @@ def disable(
     request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
 ) -> Response:
     """Disable an account."""
-    try:
-        site.people.accounts.disable(person, account, reason)
-    except AccountError as error:
-        return _refused(request, site, account, error)
-    return _back(account)
+    return _after(request, site, account, partial(site.people.accounts.disable, person, account, reason))
 
 
 @router.post(
@@ -112,11 +106,7 @@ def enable(
     request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
 ) -> Response:
     """Let a disabled account in again."""
-    try:
-        site.people.accounts.enable(person, account, reason)
-    except AccountError as error:
-        return _refused(request, site, account, error)
-    return _back(account)
+    return _after(request, site, account, partial(site.people.accounts.enable, person, account, reason))
 
 
 @router.post(
@@ -170,6 +160,15 @@ def _link(request: Request, whose: str, token: str) -> HTMLResponse:
         reachable=request.url.hostname not in ("127.0.0.1", "localhost", "::1"),
         hours=round(INVITATION_S / 3600),
     )
+
+
+def _after(request: Request, site: Site, account: str, change: Callable[[], object]) -> Response:
+    """Make a change, and go back to the account; say there why it was refused."""
+    try:
+        change()
+    except AccountError as error:
+        return _refused(request, site, account, error)
+    return _back(account)
 
 
 def _refused(request: Request, site: Site, account: str, error: AccountError) -> Response:

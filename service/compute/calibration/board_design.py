@@ -23,7 +23,7 @@ from service.compute.calibration.board_knowledge import (
 from service.compute.calibration.intrinsics import COVERAGE_GRID, coverage_map_of
 from service.compute.camera_model import CameraModel
 from service.compute.photography import ViewRange
-from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
+from service.core.geometry import Array, Transform, apply, inverse, look_at, rotation_about_z
 from service.core.units import deg, mm
 
 _ANCHORS = tuple(product((0, -1, 1), (0, -1, 1)))  # places in the frame: its middle, edges and corners
@@ -125,7 +125,7 @@ def _grid(known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Arra
     towards = approach - (approach @ normal) * normal
     towards /= np.linalg.norm(towards)
     side = np.cross(normal, towards)
-    rolls = [_roll(angle) for angle in np.radians(wishes.rolls_deg)]
+    rolls = [rotation_about_z(angle) for angle in np.radians(wishes.rolls_deg)]
     poses: list[Transform] = []
     for tilt in np.radians(wishes.tilts_deg):
         for azimuth in np.arange(wishes.azimuths if tilt > 0 else 1) * 2 * np.pi / wishes.azimuths:
@@ -134,12 +134,6 @@ def _grid(known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Arra
                 upright = look_at(middle + distance * out, middle, -towards)
                 poses += [upright @ about for about in rolls]
     return poses
-
-
-def _roll(angle_rad: float) -> Transform:
-    """Return the rotation about the optical axis."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
 
 def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _ToleranceDraws) -> Array:

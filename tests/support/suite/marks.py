@@ -29,7 +29,7 @@ class TestFunction:
     slow: bool
 
 
-def limit_s(file: str) -> float:
+def limit_of(file: str) -> float:
     """Return the CPU seconds from which on a test of a file is slow."""
     return _LIMIT_OF_GUARDS_S if file.startswith(_GUARDS) else _LIMIT_S
 
@@ -120,7 +120,7 @@ def disagreements(listed: Costs, files: Mapping[str, str]) -> list[str]:
         for name, test in tests.items():
             if name not in costs:
                 found.append(f"{file}::{name} was not measured")
-            elif test.slow != (costs[name] >= limit_s(file)):
+            elif test.slow != (costs[name] >= limit_of(file)):
                 found.append(
                     f"{file}::{name} costs {costs[name]} CPU s and is {'' if test.slow else 'not '}marked slow"
                 )
